@@ -43,7 +43,6 @@ class Heard(NamedTuple):
 
     @property
     def is_whole(self) -> bool:
-        """Whether the payload was kept."""
         return self.size == len(self.payload)
 
 
@@ -178,7 +177,6 @@ def images_of(array: np.ndarray) -> np.ndarray | None:
 
 
 def decode_scene(payload: bytes) -> Scene | wire.Rejection:
-    """Decode a scene, or say why not."""
     with contextlib.suppress(msgspec.MsgspecError, UnicodeDecodeError, RecursionError, UserError):
         scene = _DECODER.decode(payload)
         if scene.task is not None:

@@ -174,7 +174,6 @@ class WireListener:
         self._is_stopped = True
 
     def next(self, timeout_s: float) -> Heard | None:
-        """Return the next message, or None after ``timeout_s``."""
         with contextlib.suppress(queue.Empty):
             return self.queue.get(timeout=timeout_s)
         return None
@@ -370,7 +369,6 @@ def _add_record_arguments(parser: Any) -> None:
 
 
 def _run_record(arguments: Any) -> int:
-    """Record until the simulators go, or somebody interrupts."""
     tls = tls_for(arguments.tls, arguments.connect)
     path, vehicle_id = Path(arguments.out), arguments.vehicle_id or ANY_VEHICLE
     with (
@@ -417,7 +415,6 @@ def view(parser: Any) -> None:
 
 
 def add_view(parser: Any, default: str = "") -> None:
-    """Add the options that say what is heard, and where it is shown."""
     add = parser.add_mutually_exclusive_group().add_argument
     kind: Any = {"dest": "sink", "action": "store_const"}
     add("--spawn", **kind, const=SPAWN, help=f"open a rerun window{default}")

@@ -264,7 +264,6 @@ ROAD_FRAME, EGO_FRAME = "road", "ego"  # Metres; x to the right, y up on the map
 
 
 def draw_road(scene: Scene, now: Any) -> Any:
-    """Return the road from above as a SceneUpdate: wide lines, one above the other."""
     strips: list[Any] = [
         *((points, view.ROAD, scene.road_width_m) for points in scene.roads),
         *((points, view.MARKING, 0.12) for points in scene.lane_lines),
@@ -323,7 +322,6 @@ class ViewerCopies:
         self._layouts: dict[str, Layout | None] = {}  # By the vehicle, as its scenes say
 
     def write(self, heard: Heard) -> None:
-        """Copy a message, or log an event about it."""
         if heard.topic in TOKEN_TOPICS:
             who = "edge runtime" if heard.topic == "alive" else "simulator"
             what = "is here" if heard.payload == b"\x01" else "has gone"
@@ -344,7 +342,6 @@ class ViewerCopies:
             self._copy_images(heard, message, layout)
 
     def _copy_road(self, heard: Heard, scene: Scene) -> None:
-        """Copy the road from above, if there is any, and where the ego car is."""
         now = _stamp(heard)
         if scene.roads or scene.vehicles:
             self._copy(heard, "road", draw_road(scene, now))

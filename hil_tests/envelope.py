@@ -293,7 +293,6 @@ _mine: list[Any] = []  # Of a process of the pool: environment, driver, conditio
 
 
 def _load(policy: str, env: str, condition: str, key: str | None, period_s: float | None) -> Any:
-    """Return the environment, the policy as its driver, and the policy's id."""
     environment = make_environment(env, condition, period_s=period_s)
     return environment, *load_driver(policy, environment, key)
 

@@ -99,7 +99,6 @@ class Process:
         return float(wait_until(lambda: self._when(text), what, timeout_s))
 
     def tell(self, line: str) -> None:
-        """Write a line to its standard input."""
         assert self._process.stdin is not None
         self._process.stdin.write(line + "\n")
         self._process.stdin.flush()
@@ -108,7 +107,6 @@ class Process:
         self._process.send_signal(number)
 
     def kill(self) -> None:
-        """End it at once, and wait until it is gone."""
         self._process.kill()
         self.wait()
 

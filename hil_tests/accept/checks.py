@@ -80,7 +80,6 @@ class Job:
 
     @property
     def edge(self) -> list[str]:
-        """Return the options that name the settings of an edge runtime, if there are any."""
         return ["--config", self.settings.edge] if self.settings.edge else []
 
     def drivers(self, condition: str = NOMINAL) -> Drivers:

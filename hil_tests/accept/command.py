@@ -159,7 +159,6 @@ def run_checks(job: Job) -> tuple[list[dict[str, Any]], float]:
 
 
 def attempt(check: Check, job: Job) -> dict[str, Any]:
-    """Return a check's row of the report."""
     found, result, why = Found(""), NOT_TRIED, check.skipped
     if not why:
         try:

@@ -64,12 +64,10 @@ class DriveTimeline:
     unreadable: int = 0  # Commands that no receiver would take
 
     def note_state(self, state: wire.State, seen_s: float) -> None:
-        """Note a state that a policy may answer."""
         self.states.setdefault((state.session, state.episode, state.step), seen_s)
         self.flow_s.append(seen_s)
 
     def longest_gap_s(self, begin_s: float, end_s: float) -> float:
-        """Return the longest time without a command, s."""
         return longest_gap_s([c.seen_s for c in self.commands], begin_s, end_s)
 
     def stops_between(self, begin_s: float, end_s: float) -> list[str]:

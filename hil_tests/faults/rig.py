@@ -195,7 +195,6 @@ class Rig:
         return float(pressed[0])
 
     def stop_command(self, since_s: float) -> CommandSeen:
-        """Wait for the first safe_stop command after ``since_s``."""
         return self._command(lambda c: c.seen_s > since_s and c.mode == SAFE_STOP)
 
     def recovered_after_s(self, ended_s: float) -> float:
@@ -222,7 +221,6 @@ class Rig:
         return next(times, float("-inf"))
 
     def last_state_s(self, before_s: float) -> float:
-        """Return when the probe saw the newest state before ``before_s``."""
         return max(s for s in list(self.timeline.states.values()) if s < before_s)
 
     def edge_counts(self) -> Counter[str]:
@@ -274,7 +272,6 @@ class Sender:
         self._rig.probe.put("state", encode(state))
 
     def send_next(self, final: bool = False) -> None:
-        """Send the next step now."""
         with self.lock:
             self.step += 1
             self.send(self.state(self.step, final=final))

@@ -53,8 +53,6 @@ class Try:
 
 @dataclass(frozen=True)
 class Row:
-    """A row of the table of faults."""
-
     name: str
     done: str
     expected: str

@@ -34,8 +34,6 @@ frames, the brake on all others."""
 
 @dataclass
 class Outcome:
-    """What all tries of a row gave."""
-
     tries: list[Try] = field(default_factory=list)
     unsafe: list[str] = field(default_factory=list)
     crashes: list[str] = field(default_factory=list)
