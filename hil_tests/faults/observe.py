@@ -27,7 +27,7 @@ from edge_runtime.transport import open_session
 from edge_runtime.vehicles.hunter import open_bus, parse_bus
 from edge_runtime.vehicles.hunter.protocol import FRAMES
 from edge_runtime.wire import DRIVE, SAFE_STOP
-from hil_tests.testing.policies import TASK
+from hil_tests.faults.policies import TASK
 
 REACTION_LIMIT_S = 2 * TASK.control_period_s + 0.05
 """After the last good state a safe stop is out, or the other end brakes by itself."""

@@ -30,8 +30,6 @@ from edge_runtime.wire import DRIVE, SAFE_STOP, State, encode
 from hil_tests.faults import inside
 from hil_tests.faults.observe import CanMonitor, CommandSeen, DriveTimeline, Probe, Relay
 from hil_tests.processes import Process, wait_until
-from hil_tests.testing.messages import make_state
-from hil_tests.testing.policies import TASK
 
 VEHICLE_ID = "faults"
 RIDE_S = 0.5  # Of the rows with ride-through
@@ -66,7 +64,7 @@ class Rig:
         self,
         policy: Sequence[str],
         directory: Path,
-        task: Task = TASK,
+        task: Task,
         between: str = "",
         vehicle: str = "none",
         sender: bool = False,
@@ -293,15 +291,15 @@ class Sender:
                 self.send_next()
 
 
-def noisy_state(step: int, task: Task = TASK, **changes: Any) -> State:
+def noisy_state(step: int, task: Task, **changes: Any) -> State:
     """Make a valid state of the task, which sees noise."""
     seen = inside.noise(task, np.random.default_rng(step)).items()
     fields: dict[str, Any] = {
-        "session": "campaign", "sim_time_s": round(step * task.control_period_s, 6),
-        "speed_mps": 3.0,
+        "session": "campaign", "episode": 0, "step": step, "speed_mps": 3.0, "final": False,
+        "sim_time_s": round(step * task.control_period_s, 6), "sent_ns": time.time_ns(),
         "observation": {name: value.tobytes() for name, value in seen},
     }  # fmt: skip
-    return make_state(step, **{**fields, **changes})
+    return State(**{**fields, **changes})
 
 
 class Chassis(Process):
