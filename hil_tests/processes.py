@@ -143,11 +143,6 @@ class Process:
         gone = self.has_ended and not self._ended_by_us
         return gone or any(mark in line for _, line in self.lines for mark in _CRASH_MARKS)
 
-    def resident_mb(self) -> float:
-        """Return its resident memory, MB (10^6 bytes)."""
-        pages = Path(f"/proc/{self.pid}/statm").read_text().split()[1]
-        return int(pages) * os.sysconf("SC_PAGE_SIZE") / 1e6
-
     def __enter__(self) -> Self:
         return self
 
