@@ -46,6 +46,10 @@ from edge_runtime.policy import Policy, infer, load_policy
 from edge_runtime.util import UserError, counted, name_in_file, printable
 from edge_runtime.wire import Command, State, decode_state, encode
 
+EXAMPLE = cli.examples(
+    "python -m bridge fork drive.mcap --at 12.3s --policy other.onnx --out fork.json"
+)
+
 
 @dataclass
 class RecordedEpisode:
@@ -224,7 +228,7 @@ def find_fork(recording: str, asked: Namespace) -> tuple[RecordedEpisode, int]:
     return drives[number], drives[number].step_at(asked.at)
 
 
-def _add_fork_arguments(parser: Any) -> None:
+def add_arguments(parser: Any) -> None:
     add = parser.add_argument
     add("recording", metavar="F.mcap", type="path", help="a file of bridge record")
     add_place(parser)
@@ -239,7 +243,7 @@ def _add_fork_arguments(parser: Any) -> None:
     add_options(parser, "--out")
 
 
-def _run_fork(asked: Namespace) -> int:
+def run(asked: Namespace) -> int:
     if asked.human is not None:
         _hand_over(asked)
     drive, fork = find_fork(asked.recording, asked)
@@ -280,7 +284,3 @@ def _hand_over(asked: Namespace) -> None:
     words = [str(word) for pair in given.items() if pair[1] is not None for word in pair]
     command = [sys.executable, "-m", "trainer", "drive", "--from", asked.recording, *words]
     os.execv(sys.executable, command)
-
-
-EXAMPLE = "python -m bridge fork drive.mcap --at 12.3s --policy other.onnx --out fork.json"
-FORK = cli.Subcommand(cli.examples(EXAMPLE), _add_fork_arguments, _run_fork)

@@ -51,8 +51,7 @@ class Outage:
 
 _S = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 _MS = {"ms": 1.0, "us": 1e-3, "s": 1e3}
-_PERCENT = {"%": 1.0}
-_RATES = {"kbit/s": 1.0, "bit/s": 1e-3, "Mbit/s": 1e3, "Gbit/s": 1e6}
+_KBPS = {"kbit/s": 1.0, "bit/s": 1e-3, "Mbit/s": 1e3, "Gbit/s": 1e6}
 
 
 def _quantity(
@@ -80,9 +79,9 @@ def _read_outages(text: str) -> tuple[Outage, ...]:
     return tuple(windows)
 
 
-_ms, _percent = partial(_quantity, units=_MS), partial(_quantity, units=_PERCENT, most=100.0)
+_ms, _percent = partial(_quantity, units=_MS), partial(_quantity, units={"%": 1.0}, most=100.0)
 _messages = partial(_quantity, units={"": 1.0}, most=1e6, least=1.0)
-_kbps = partial(_quantity, units=_RATES, most=1e9, least=math.ulp(0.0))
+_kbps = partial(_quantity, units=_KBPS, most=1e9, least=math.ulp(0.0))
 
 
 def _setting(default: Any, name: str, example: str, read: Callable[[str], Any]) -> Any:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from bridge.fork import FORK
+from bridge import fork
 from deploy.__main__ import main as deploy
 from deploy.bundle import build_installer
 from edge_runtime.cli import ArgumentParser
@@ -75,7 +75,7 @@ def test_without_systemd_under_python38_it_installs_offline_and_drives(tmp_path)
 @pytest.mark.parametrize(
     ("command", "words"),
     [
-        (FORK, "f.mcap --at 1 --policy p.onnx --record g.mcap --out f.json"),
+        (fork, "f.mcap --at 1 --policy p.onnx --record g.mcap --out f.json"),
         (commands.campaign, "--policy p.onnx --out r.json"),
         (commands.envelope, "--policy p.onnx --out r.json"),
     ],
