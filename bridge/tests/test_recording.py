@@ -60,7 +60,7 @@ from edge_runtime.wire import (
     encode,
 )
 from hil_tests.processes import wait_until
-from hil_tests.testing.drives import (
+from hil_tests.tests.shared.drives import (
     LEFT_TURN,
     SLOW_TOY,
     make_policy,
@@ -68,8 +68,8 @@ from hil_tests.testing.drives import (
     start_edge,
     start_simulate,
 )
-from hil_tests.testing.messages import make_command, make_state
-from hil_tests.testing.policies import SIZE, TASK
+from hil_tests.tests.shared.messages import make_command, make_state
+from hil_tests.tests.shared.policies import SIZE, TASK
 
 ODD = Task(task="", observation={"a": Entry(dtype="odd", shape=[1])}, action=[], control_period_s=1)
 ROOT = Path(__file__).parents[2]

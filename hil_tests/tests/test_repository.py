@@ -53,7 +53,7 @@ OURS = re.compile(
 
 def sources(folder: str) -> list[Path]:
     """Return the folder's files without tests and their helpers, which may use all folders."""
-    others = {"tests", "testing", "build"}
+    others = {"tests", "build"}
     return [p for p in (ROOT / folder).rglob("*.py") if not others & set(p.parts)]
 
 

@@ -25,10 +25,10 @@ from edge_runtime.tls import load_tls, rules_for_edge, rules_for_listener
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
 from hil_tests.processes import Process
-from hil_tests.testing.commands import run_command
-from hil_tests.testing.drives import SLOW_TOY, make_policy, read, run_edge
-from hil_tests.testing.messages import make_state
-from hil_tests.testing.policies import T
+from hil_tests.tests.shared.commands import run_command
+from hil_tests.tests.shared.drives import SLOW_TOY, make_policy, read, run_edge
+from hil_tests.tests.shared.messages import make_state
+from hil_tests.tests.shared.policies import T
 
 SETTLE_S = 0.4
 """Until both ends know of a declaration, and until what must not come would have come."""

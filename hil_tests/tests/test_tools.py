@@ -15,8 +15,8 @@ from edge_runtime.reach import free_endpoint
 from hil_tests import commands
 from hil_tests.__main__ import main
 from hil_tests.processes import POLICY, PUBLIC_KEY, wait_until
-from hil_tests.testing.commands import exit_status
-from hil_tests.testing.drives import read, start_simulate
+from hil_tests.tests.shared.commands import exit_status
+from hil_tests.tests.shared.drives import read, start_simulate
 
 ROOT = Path(__file__).parents[2]
 

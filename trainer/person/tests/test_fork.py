@@ -7,8 +7,8 @@ import pytest
 from bridge import fork
 from bridge.fork import RecordedEpisode
 from bridge.tests.recordings import record_in_process
-from hil_tests.testing.commands import call
-from hil_tests.testing.policies import write_policy
+from hil_tests.tests.shared.commands import call
+from hil_tests.tests.shared.policies import write_policy
 from trainer.person.recording import find_recordings, read_episodes, read_steps
 from trainer.person.tests.people import LET_GO, QUIT, Puppet, hold
 
