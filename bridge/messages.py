@@ -145,7 +145,6 @@ _DECODER = msgspec.msgpack.Decoder(Scene)
 
 
 def encode_scene(scene: dict[str, Any], stamps: Scene) -> bytes:
-    """Encode an environment's ``scene()`` and the simulator's own fields as a MessagePack map."""
     own = msgspec.structs.asdict(stamps).items()
     drawn = SeenScene.__struct_fields__
     return ENCODER.encode({**scene, **{name: value for name, value in own if name not in drawn}})

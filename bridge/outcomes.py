@@ -36,7 +36,6 @@ def outcome_of(info: Mapping[str, Any], only_truncated: bool = False) -> str:
 
 
 def is_told(outcomes: Iterable[str]) -> bool:
-    """Return whether any of the outcomes says something about success."""
     return not UNTOLD.issuperset(outcomes)
 
 

@@ -62,7 +62,6 @@ class Recording:
         return "was cut off" if self.cut_off else ""
 
     def say_trouble(self) -> None:
-        """Print the trouble, if any, in one line on stderr."""
         if trouble := self.trouble():
             line = f"the recording {self.path} {trouble}; what is whole of it is taken"
             print(line, file=sys.stderr, flush=True)

@@ -240,7 +240,6 @@ class ProgressBar:
         self._bar.stop()
 
     def advance(self, figures: dict[str, str], count: int = 1) -> None:
-        """Count ``count`` more and show the figures."""
         self.done += count
         text = "  ".join(f"{name} {value}" for name, value in figures.items())
         self._bar.update(self._task, completed=self.done, figures=text)

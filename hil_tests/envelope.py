@@ -60,8 +60,6 @@ AXES = {
 
 
 class Tried(TypedDict):
-    """What was found of a network."""
-
     verdict: str
     drives: int
     successes: int

@@ -35,8 +35,7 @@ class CommandTimeoutError(UserError, TimeoutError):
 
 
 class Process:
-    """``python -m ARGUMENTS`` beside us. It ends with the ``with`` block, and
-    with the thread that started it.
+    """``python -m ARGUMENTS`` beside us. It ends with the block, and the thread that started it.
 
     ``lines`` are its output of both streams with their monotonic times; ``output`` and ``errors``
     are the text of each stream. With ``ready``, a text, the constructor waits until that is

@@ -191,7 +191,6 @@ class Viewer:
             raise
 
     def end(self) -> None:
-        """End it, even where it hangs."""
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()

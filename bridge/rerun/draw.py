@@ -174,7 +174,6 @@ def sees_view(frames: bool = True) -> rrb.Horizontal:
 def two_columns(
     left: rrb.Container, right: rrb.Container, column_shares: list[int], timeline: str
 ) -> rrb.Blueprint:
-    """Lay out two columns and nothing else open, along ``timeline``."""
     return rrb.Blueprint(
         rrb.Horizontal(left, right, column_shares=column_shares),
         rrb.BlueprintPanel(state="collapsed"),

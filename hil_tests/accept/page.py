@@ -75,7 +75,6 @@ def draw_distance(axis: str, found: Mapping[str, Any]) -> Figure:
 
 
 def draw_times(found: Mapping[str, Any]) -> Figure:
-    """Draw how long the edge runtime took for its answers, against T."""
     figure = Figure(figsize=(4.6, 3.0), layout="constrained")
     panel, period_ms = figure.subplots(), found["period_ms"]
     times_ms = np.maximum(found["edge_ms"], 0.01)

@@ -188,7 +188,6 @@ def with_fields(valid: bytes, **changes: object) -> bytes:
 
 
 def without(valid: bytes, name: str) -> bytes:
-    """Remove a field of a MessagePack map."""
     fields = msgspec.msgpack.decode(valid)
     del fields[name]
     return msgspec.msgpack.encode(fields)

@@ -239,9 +239,7 @@ class CanMonitor(can.Listener):
 
     def __init__(self, bus: str) -> None:
         self.heard: list[tuple[float, int, bytes]] = []  # Monotonic time, identifier, data
-        self.strange: list[
-            int
-        ] = []  # Identifiers that are not the Hunter's: nobody should send any
+        self.strange: list[int] = []  # Identifiers that nobody should send: not the Hunter's
         self._bus = open_bus(parse_bus(bus))
         self._notifier = can.Notifier(self._bus, [self], timeout=0.1)
 

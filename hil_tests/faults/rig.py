@@ -48,9 +48,8 @@ class Rig:
     ``vehicle`` is its ``--vehicle``. The ``directory`` is an empty one, for switches and reports.
     Edge runtime and probe meet at a ``relay`` or a ``router`` where ``between`` says so. ``sender``
     sends states here, without a simulator; with ``senses`` a source stands in its place.
-    ``settings`` is TOML for the edge runtime. With the
-    vehicle ``hunter`` there is a mock of it on a CAN bus. The attributes below exist only where the
-    options ask for them.
+    ``settings`` is TOML for the edge runtime. With the vehicle ``hunter`` there is a mock of it on
+    a CAN bus. The attributes below exist only where the options ask for them.
     """
 
     simulator: Process
