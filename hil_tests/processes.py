@@ -11,12 +11,11 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Self
 
 from edge_runtime.link import ask
-from edge_runtime.reach import free_endpoint
 from edge_runtime.util import UserError
 from trainer.util import kept
 
@@ -193,28 +192,6 @@ def run_command(*arguments: object) -> None:
         status = process.wait()
     if status:
         raise UserError(f"{' '.join(words[:4])} ended with status {status}")
-
-
-def drive_shown(
-    vehicle_id: str, trust: Sequence[str], simulate: Sequence[str], listener: Sequence[str] = ()
-) -> None:
-    """Drive the left turn with a mock vehicle and an operator, by commands as a person types them.
-
-    ``trust`` are the edge runtime's options for its policy, ``simulate`` further ones of ``bridge
-    simulate``; ``listener`` is a command of the bridge that ends after the drive. UserError.
-    """
-    endpoint = free_endpoint()
-    common = ("--connect", endpoint, "--vehicle-id", vehicle_id)
-    with contextlib.ExitStack() as stack:
-        edge = ("edge_runtime", "run", *trust, *common, "--vehicle", "mock")
-        stack.enter_context(Process(*edge, ready="ready", shown=True))
-        beside = Process("bridge", *listener, *common, shown=True) if listener else None
-        stack.enter_context(beside or contextlib.nullcontext())
-        stack.enter_context(operator(endpoint, vehicle_id))
-        where = ("--listen", endpoint, "--vehicle-id", vehicle_id)
-        run_command("bridge", "simulate", "--env", "left_turn", *simulate, *where)
-        if beside is not None:
-            beside.succeed()
 
 
 def wait_until(
