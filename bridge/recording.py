@@ -55,14 +55,11 @@ class Recording:
         """The file has no end of its own: a kill, or damage beyond which nothing can be read."""
         self.damaged_places = 0  # Chunks that do not match their checksums
 
-    def trouble(self) -> str:
-        """Return what is wrong with the file, as a verb with its object; empty: nothing."""
-        if self.damaged_places:
-            return f"has {counted(self.damaged_places, 'damaged place')}"
-        return "was cut off" if self.cut_off else ""
-
     def say_trouble(self) -> None:
-        if trouble := self.trouble():
+        trouble = "was cut off" if self.cut_off else ""
+        if self.damaged_places:
+            trouble = f"has {counted(self.damaged_places, 'damaged place')}"
+        if trouble:
             line = f"the recording {self.path} {trouble}; what is whole of it is taken"
             print(line, file=sys.stderr, flush=True)
 
