@@ -61,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         for rule, is_kept in RULES.items():
             try:
-                wrong = "" if is_kept(bench) else f"last report: {bench.last}"
+                wrong = "" if is_kept(bench) else in_words(bench.last)
             # A driver may raise anything, and the next rule is due.
             except (Exception, SystemExit) as error:
                 wrong = f"{type(error).__name__}: {error}"
@@ -74,6 +74,14 @@ def run(arguments: argparse.Namespace) -> int:
     write_json_out(arguments.out, {"vehicle": vehicle.name, "rules": rules})
     print(f"{vehicle.name}: {kept} rules kept, {len(RULES) - kept} broken")
     return 0 if kept == len(RULES) else 1
+
+
+def in_words(report: VehicleReport | None) -> str:
+    if report is None:
+        return "it has not reported yet"
+    told = {**report._asdict(), **report.action, "faults": "; ".join(report.faults), "action": None}
+    words = (f"{name} {value}" for name, value in told.items() if value is not None)
+    return f"last report: {', '.join(words)}"
 
 
 class Bench:
