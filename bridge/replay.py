@@ -103,10 +103,7 @@ def run(arguments: Any) -> int:
 
 
 def report_replay(
-    drive: RecordedDrive,
-    policy: Policy,
-    config: Config,
-    tolerance: float = DEFAULT_TOLERANCE,
+    drive: RecordedDrive, policy: Policy, config: Config, tolerance: float = DEFAULT_TOLERANCE
 ) -> tuple[dict[str, Any], list[Drawn]]:
     """Replay a drive; return the command's report, and what a picture shows.
 
