@@ -16,7 +16,7 @@ from deploy.bundle import build_edge_wheel, build_installer, gather
 from deploy.installer.release import Releases, read_bundle, read_public_key
 from edge_runtime.config import load_config
 from edge_runtime.util import UserError
-from hil_tests.testing.commands import exit_status, refusal
+from hil_tests.tests.shared.commands import exit_status, refusal
 
 
 @pytest.fixture(scope="module")

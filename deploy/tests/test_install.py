@@ -19,8 +19,8 @@ from deploy.installer import systemd
 from deploy.installer.release import CURRENT, PREVIOUS, Releases
 from deploy.tests.boards import HERE, Board
 from edge_runtime.util import UserError
-from hil_tests.testing.drives import Simulator
-from hil_tests.testing.messages import make_state
+from hil_tests.tests.shared.drives import Simulator
+from hil_tests.tests.shared.messages import make_state
 
 RUN = "edge_runtime/run.py"
 MOCK = "edge_runtime/vehicles/mock.py"

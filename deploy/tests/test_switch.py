@@ -19,7 +19,7 @@ from deploy.installer.release import CURRENT, PREVIOUS, Manifest, Releases
 from deploy.installer.systemd import Systemd, UnhealthyError
 from deploy.tests.boards import HERE
 from edge_runtime.files import write_atomic
-from hil_tests.testing.policies import public_pem
+from hil_tests.tests.shared.policies import public_pem
 
 EARLIER, OLD, NEW = "0.1.0-earlier", "0.1.0-old", "0.1.0-new"
 

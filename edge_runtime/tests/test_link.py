@@ -12,7 +12,7 @@ from unittest.mock import MagicMock
 import pytest
 import zenoh
 from hil_tests.processes import wait_until
-from hil_tests.testing.messages import HEALTH
+from hil_tests.tests.shared.messages import HEALTH
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import List
 
 import pytest
-from hil_tests.testing.drives import Simulator, run_edge
-from hil_tests.testing.messages import make_state
+from hil_tests.tests.shared.drives import Simulator, run_edge
+from hil_tests.tests.shared.messages import make_state
 
 import edge_runtime
 from edge_runtime.__main__ import script

@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 from hil_tests.processes import Process, wait_until
-from hil_tests.testing.commands import run_command
-from hil_tests.testing.drives import Simulator, run_edge
-from hil_tests.testing.messages import WHITE, frames, make_state
-from hil_tests.testing.policies import T
+from hil_tests.tests.shared.commands import run_command
+from hil_tests.tests.shared.drives import Simulator, run_edge
+from hil_tests.tests.shared.messages import WHITE, frames, make_state
+from hil_tests.tests.shared.policies import T
 
 from edge_runtime.reach import free_endpoint
 

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 from hil_tests.processes import wait_until
-from hil_tests.testing.drives import run_edge
-from hil_tests.testing.messages import make_state
-from hil_tests.testing.policies import PEDAL, TASK, T
+from hil_tests.tests.shared.drives import run_edge
+from hil_tests.tests.shared.messages import make_state
+from hil_tests.tests.shared.policies import PEDAL, TASK, T
 
 from edge_runtime import log, loop
 from edge_runtime.controller import Controller, ControllerConfig, shared_limits

@@ -17,7 +17,7 @@ import pytest
 
 from bridge.outcomes import COLLISION, GOAL
 from edge_runtime.util import UserError
-from hil_tests.testing.commands import call, refusal
+from hil_tests.tests.shared.commands import call, refusal
 from trainer import experiments as plan
 from trainer.environments import CONDITIONS, make_environment
 from trainer.evaluation import BEST_FILE, CHECKPOINT_FILE
