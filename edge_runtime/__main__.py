@@ -1,7 +1,7 @@
 """The command line: `python -m edge_runtime`, or `phil-edge` where the wheel is installed.
 
 Here are the commands that do not drive: `check` of a policy, and an operator's `status` and
-`rearm`. `run` and `sense` are in files of these names.
+`rearm`. `run`, `sense` and `jog` are in files of these names.
 """
 
 from __future__ import annotations
@@ -144,6 +144,7 @@ COMMANDS = {
     "check": (check, "check whether a policy may drive, and measure its inference time"),
     "run": ("edge_runtime.run", "drive a policy: answer each state of a simulator until ^C"),
     "sense": ("edge_runtime.sense", "send a source's observations in the simulator's place"),
+    "jog": ("edge_runtime.jog", "try a vehicle step by step, its wheels up, before it drives"),
     "status": (status, "print the status of a running edge runtime"),
     "rearm": (rearm, "let a vehicle drive again after a safe stop"),
 }

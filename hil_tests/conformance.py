@@ -17,7 +17,7 @@ from edge_runtime import log
 from edge_runtime.cli import examples
 from edge_runtime.config import NONE, load_config
 from edge_runtime.files import check_writable, write_json_out
-from edge_runtime.manifest import Action, Car, Entry, Manifest
+from edge_runtime.jog import bench_manifest
 from edge_runtime.util import UserError, printable
 from edge_runtime.vehicles import make_vehicle
 from edge_runtime.vehicles.base import Vehicle, VehicleReport, close_in_time
@@ -27,9 +27,6 @@ CALL_S = 0.05  # a call that takes longer holds back the runtime's feedback
 MOVES_MPS, STANDS_MPS = 0.1, 0.05
 ROUNDING = 1e-3
 PATIENCE_S = 10.0  # until it moves, or stands
-CAR = Car(
-    throttle_mps2=3.0, brake_mps2=4.0, max_speed_mps=6.0, full_steering_rad=0.5, wheelbase_m=5.0
-)
 EXAMPLE = examples(
     "python -m hil_tests conformance --vehicle mock",
     "python -m hil_tests conformance --vehicle my_vehicle:Rover --config edge.toml",
@@ -51,11 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
     if config.vehicle == NONE:
         raise UserError("no vehicle to try: name it with --vehicle")
     log.configure("error")
-    manifest = Manifest(
-        task="conformance", observation={"frames": Entry(dtype="uint8", shape=[1])}, car=CAR,
-        action=[Action(name=name, low=-1.0, high=1.0) for name in ("pedal", "steering")],
-        control_period_s=arguments.period_s, algorithm="", training={}, created="",
-    )  # fmt: skip
+    manifest = bench_manifest("conformance", arguments.period_s)
     vehicle = make_vehicle(config.vehicle, config.vehicle_settings, manifest)
     bench, rules = Bench(vehicle, arguments.period_s), dict[str, str]()
     try:

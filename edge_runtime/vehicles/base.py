@@ -29,12 +29,17 @@ class Vehicle(abc.ABC):
     The runtime sets `control_period_s` to the policy's before `enable`; until then it is the
     shortest that a policy may have, which brakes soonest. A driver drives no faster than
     `allowed.max_speed_mps`; the runtime stops one that does, and sees to the other bounds.
+
+    For `jog`: `outranked_by` has what its reports' `standing` says of a "remote_control" and an
+    "emergency_stop", where they tell; `steers_at_a_stand` is False where they then tell no angle.
     """
 
     name: ClassVar[str]
     limits: Limits
     model_limits: Model = Model()
     allowed: Bounds = NO_BOUNDS
+    outranked_by: ClassVar[Mapping[str, str]] = {}
+    steers_at_a_stand: bool = True
     control_period_s: float = MIN_PERIOD_S
 
     def __init_subclass__(cls, **options: Any) -> None:
@@ -89,6 +94,12 @@ class Vehicle(abc.ABC):
 
         The vehicle moves again after `enable`; with `latch` False (the end of an episode) already
         with the next command.
+        """
+
+    def mute(self) -> None:  # noqa: B027 (most drivers need none)
+        """Send the vehicle nothing until `brake` or `close`, as if the process had died.
+
+        For `jog` alone, where a driver sends by itself.
         """
 
     @abc.abstractmethod

@@ -260,7 +260,7 @@ class StreamedVehicle(Vehicle):
         self._core = core
         self.limits, self.model_limits = core.similarity.limits(), core.similarity.model()
         self._lock = threading.Lock()
-        self._closed = self._ending = False
+        self._closed = self._ending = self._is_mute = False
         self._logged = ("", "")
         self._wake = threading.Event()  # send now
         self._stream = threading.Thread(target=self._run, name=f"{self.name}-stream", daemon=True)
@@ -304,9 +304,13 @@ class StreamedVehicle(Vehicle):
 
     def brake(self, now_s: float, latch: bool = True) -> None:
         """Send speed 0 at once, not with the next period."""
+        self._is_mute = False
         with self._lock:
             self._core.brake(now_s, latch)
         self._wake.set()
+
+    def mute(self) -> None:
+        self._is_mute = True
 
     def feedback(self, now_s: float) -> VehicleReport:
         with self._lock:
@@ -351,7 +355,7 @@ class StreamedVehicle(Vehicle):
         while not self._ending:
             self._wake.clear()
             began_s = time.monotonic()
-            sent = self._send_due()
+            sent = not self._is_mute and self._send_due()
             now_s = time.monotonic()
             if sent and now_s - began_s > PERIOD_S:
                 # A process that was stopped in between has sent what was asked for before.

@@ -32,6 +32,7 @@ STATUS_SILENCE_S = 0.3  # three frames of 0x211; 0x221 comes five times as often
 COUNTERS = 256  # byte 7 of 0x211 runs over
 ASK_AGAIN_S = 0.1  # a frame may be lost, and the chassis answers every 100 ms
 BUS_PATIENCE_S = 0.1  # five frames of the stream
+REMOTE_DRIVES, ESTOP_PRESSED = "the remote control drives", "the emergency stop is pressed"
 
 _TAKE = protocol.MODE_COMMAND.sent(protocol.ByteCommand(protocol.CAN_CONTROL))
 _GIVE_BACK = protocol.MODE_COMMAND.sent(protocol.ByteCommand(protocol.STANDBY))
@@ -102,9 +103,9 @@ class Reports(streamed.Speeds):
         if status is None:
             return Finding(Fault.SILENT, "the chassis sends no 0x211")
         if status.mode == protocol.REMOTE_CONTROL:
-            return Finding(VehicleEvent.REMOTE, "the remote control drives")
+            return Finding(VehicleEvent.REMOTE, REMOTE_DRIVES)
         if status.state == protocol.STATE_ESTOP:
-            return Finding(VehicleEvent.ESTOP, "the emergency stop is pressed")
+            return Finding(VehicleEvent.ESTOP, ESTOP_PRESSED)
         if errors := self._errors():
             return Finding(VehicleEvent.FAULT, ", ".join(errors))
         if status.state != protocol.STATE_OK:
@@ -286,6 +287,9 @@ class HunterVehicle(streamed.StreamedVehicle):
 
     name: ClassVar[str] = "hunter"
     settings_type: ClassVar[Type[RobotSettings]] = HunterSettings
+    outranked_by: ClassVar[Dict[str, str]] = {
+        "remote_control": REMOTE_DRIVES, "emergency_stop": ESTOP_PRESSED,
+    }  # fmt: skip
 
     def __init__(self, settings: HunterSettings, similarity: Similarity) -> None:
         bus = parse_bus(settings.bus)

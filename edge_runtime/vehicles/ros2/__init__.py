@@ -221,6 +221,7 @@ class Ros2Vehicle(streamed.StreamedVehicle):
         self._core: Ros2Core
         super().__init__(Ros2Core(settings, similarity))
         self._angular, self._fails = settings.twist_angular, False
+        self.steers_at_a_stand = settings.twist_angular == settings.odometry_angular == STEERING
         # A router (by default on loopback), or a peer that goes on connecting to a bridge.
         connect, listen = settings.connect, settings.listen
         if connect is None and listen is None:
