@@ -9,7 +9,7 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 discover = Distribution.discover
-pytest.register_assert_rewrite("hil_tests.testing")
+pytest.register_assert_rewrite("hil_tests.tests.shared")
 
 
 class SignedPolicy(NamedTuple):
@@ -25,7 +25,7 @@ class SignedPolicy(NamedTuple):
 @pytest.fixture
 def make_policy(tmp_path: Path) -> Callable[..., SignedPolicy]:
     """Write a signed policy file of a kind, with the public key beside it."""
-    from hil_tests.testing.policies import public_pem, write_policy  # loads onnx
+    from hil_tests.tests.shared.policies import public_pem, write_policy  # loads onnx
 
     def make(kind: str = "constant", **options: object) -> SignedPolicy:
         key = Ed25519PrivateKey.generate()

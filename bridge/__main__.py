@@ -9,12 +9,15 @@ from edge_runtime.cli import program, run_cli
 
 COMMANDS = {
     "simulate": ("bridge.simulate", "serve an environment to an edge runtime"),
-    "sense": ("bridge.sense", "serve a robot's own senses to an edge runtime, not a simulator's"),
-    "router": ("bridge.ports:ROUTER", "connect simulators, edge runtimes and viewers"),
-    "record": ("bridge.ports:RECORD", "write everything on the wire to an MCAP recording"),
+    "sense": (
+        "bridge.ports:sense",
+        "serve a robot's own senses to an edge runtime, not a simulator's",
+    ),
+    "router": ("bridge.ports:router", "connect simulators, edge runtimes and viewers"),
+    "record": ("bridge.ports:record", "write everything on the wire to an MCAP recording"),
     "replay": ("bridge.replay", "run recorded states through a policy, and compare"),
     "shadow": ("bridge.shadow", "answer beside the policy that drives, and move nothing"),
-    "fork": ("bridge.fork:FORK", "rebuild a recorded drive, and drive on in another way"),
+    "fork": ("bridge.fork", "rebuild a recorded drive, and drive on in another way"),
     "export": ("bridge.lerobot", "turn a recording into a LeRobot data set"),
     "view": ("bridge.ports:view", "show the wire in rerun, live or in a file"),
 }

@@ -85,7 +85,6 @@ class _Clock:
         pass
 
     def _stamped(self, state: State) -> bytes:
-        """Encode the state as it leaves now: with the wall clock and the commands heard."""
         heard = self.check.heard
         return encode(msgspec.structs.replace(state, sent_ns=time.time_ns(), **heard))
 
@@ -269,7 +268,6 @@ class VehicleClock(RealTimeClock):
             raise UserError(f"no vehicle reports after {limit_s:g} s; start one: {start}")
 
     def wait_for_standstill(self) -> None:
-        """Wait until the vehicle stands, or STANDSTILL_WAIT_S are over."""
         self._wait_until(lambda told: abs(told.speed_mps) < STANDSTILL_MPS, STANDSTILL_WAIT_S)
 
     def rejected(self) -> Counter[str]:

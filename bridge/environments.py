@@ -150,7 +150,6 @@ def describe(
 
 
 def name_of(environment: Environment) -> str:
-    """Return the environment's id, or the name of its class."""
     spec = environment.spec
     return spec.id if spec else type(environment.unwrapped).__name__
 
@@ -255,7 +254,6 @@ def scene_of(environment: Environment) -> dict[str, Any] | None:
 
 
 def draws(environment: Environment) -> bool:
-    """Return whether ``render()`` returns a picture."""
     modes = environment.metadata.get("render_modes") or ()
     return environment.render_mode == RENDERED and RENDERED in modes
 
@@ -299,7 +297,6 @@ class Adapter:
         return self.last
 
     def stop(self) -> np.ndarray:
-        """Return the action of a safe stop."""
         if (own := offered(self.env, "brake_action")) is not None:
             return self.within(own)
         pairs = zip(self.task.action, self.last.ravel().tolist(), strict=True)

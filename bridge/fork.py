@@ -46,6 +46,10 @@ from edge_runtime.policy import Policy, infer, load_policy
 from edge_runtime.util import UserError, counted, name_in_file, printable
 from edge_runtime.wire import Command, State, decode_state, encode
 
+EXAMPLE = cli.examples(
+    "python -m bridge fork drive.mcap --at 12.3s --policy other.onnx --out fork.json"
+)
+
 
 @dataclass
 class RecordedEpisode:
@@ -87,16 +91,6 @@ class RecordedEpisode:
         if (now := describe(made, self.task.control_period_s).text) != self.task.text:
             raise UserError(f"{self.path} was driven in {self.task.text!r}, and {name} is {now!r}")
         return made
-
-
-def read_episode(path: Path, vehicle_id: str | None, number: int | None) -> RecordedEpisode:
-    """Read an episode; ``number`` None: the only one."""
-    drives = read_episodes(path, vehicle_id, number)
-    number = 0 if number is None and len(drives) == 1 else number
-    if number is None or number >= len(drives):
-        which = f"{counted(len(drives), 'drive')} with scenes; --episode says which, from 0"
-        raise UserError(f"{path} holds {which}")
-    return drives[number]
 
 
 def read_episodes(
@@ -225,12 +219,16 @@ def add_place(parser: Any) -> None:
 
 
 def find_fork(recording: str, asked: Namespace) -> tuple[RecordedEpisode, int]:
-    """Return the drive that the options name, and the step of the fork."""
-    drive = read_episode(Path(recording), asked.vehicle_id, asked.episode)
-    return drive, drive.step_at(asked.at)
+    """Return the drive that the options name, or the only one, and the step of the fork."""
+    drives = read_episodes(Path(recording), asked.vehicle_id, asked.episode)
+    number = 0 if asked.episode is None and len(drives) == 1 else asked.episode
+    if number is None or number >= len(drives):
+        which = f"{counted(len(drives), 'drive')} with scenes; --episode says which, from 0"
+        raise UserError(f"{recording} holds {which}")
+    return drives[number], drives[number].step_at(asked.at)
 
 
-def _add_fork_arguments(parser: Any) -> None:
+def add_arguments(parser: Any) -> None:
     add = parser.add_argument
     add("recording", metavar="F.mcap", type="path", help="a file of bridge record")
     add_place(parser)
@@ -245,7 +243,7 @@ def _add_fork_arguments(parser: Any) -> None:
     add_options(parser, "--out")
 
 
-def _run_fork(asked: Namespace) -> int:
+def run(asked: Namespace) -> int:
     if asked.human is not None:
         _hand_over(asked)
     drive, fork = find_fork(asked.recording, asked)
@@ -286,7 +284,3 @@ def _hand_over(asked: Namespace) -> None:
     words = [str(word) for pair in given.items() if pair[1] is not None for word in pair]
     command = [sys.executable, "-m", "trainer", "drive", "--from", asked.recording, *words]
     os.execv(sys.executable, command)
-
-
-EXAMPLE = "python -m bridge fork drive.mcap --at 12.3s --policy other.onnx --out fork.json"
-FORK = cli.Subcommand(cli.examples(EXAMPLE), _add_fork_arguments, _run_fork)

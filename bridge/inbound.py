@@ -35,8 +35,6 @@ COMMAND_ROUNDING, FEEDBACK_ROUNDING = 1e-6, 5e-4
 
 @dataclass(frozen=True)
 class Decision:
-    """The vehicle's decision in one tick."""
-
     command: Command | None  # The newest command, held; None before the first of the episode
     fresh: bool  # It arrived since the decision before this one
     brake_reason: str  # Why the vehicle brakes; empty while it obeys the command

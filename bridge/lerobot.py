@@ -156,7 +156,6 @@ def _numbers(drive: RecordedDrive, task: Task, rate: Fraction) -> tuple[Columns,
 
 
 def _feature(values: Any) -> dict[str, Any]:
-    """Return the feature's entry of info.json."""
     dtype = "string" if values.dtype.kind == "U" else values.dtype.name
     return {"dtype": dtype, "shape": [math.prod(values.shape[1:])], "names": None}
 

@@ -43,7 +43,6 @@ class Heard(NamedTuple):
 
     @property
     def is_whole(self) -> bool:
-        """Whether the payload was kept."""
         return self.size == len(self.payload)
 
 
@@ -146,7 +145,6 @@ _DECODER = msgspec.msgpack.Decoder(Scene)
 
 
 def encode_scene(scene: dict[str, Any], stamps: Scene) -> bytes:
-    """Encode an environment's ``scene()`` and the simulator's own fields as a MessagePack map."""
     own = msgspec.structs.asdict(stamps).items()
     drawn = SeenScene.__struct_fields__
     return ENCODER.encode({**scene, **{name: value for name, value in own if name not in drawn}})
@@ -178,7 +176,6 @@ def images_of(array: np.ndarray) -> np.ndarray | None:
 
 
 def decode_scene(payload: bytes) -> Scene | wire.Rejection:
-    """Decode a scene, or say why not."""
     with contextlib.suppress(msgspec.MsgspecError, UnicodeDecodeError, RecursionError, UserError):
         scene = _DECODER.decode(payload)
         if scene.task is not None:

@@ -12,7 +12,7 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import partial
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -49,60 +49,9 @@ class Outage:
         return (since_s % self.period_s if self.period_s else since_s) < self.length_s
 
 
-@dataclass(frozen=True)
-class DirectionSpec:
-    """One direction of the network. UserError for impossible bursts."""
-
-    delay_ms: float = 0.0  # Mean time under way
-    jitter_ms: float = 0.0
-    """Standard deviation of the time under way; what falls below zero becomes zero."""
-    tail: str = NORMAL
-    """Distribution of the time under way (`SHAPES`); mean and standard deviation stay."""
-    loss_percent: float = 0.0  # Share of messages that never arrive, over good and bad stretches
-    burst_messages: float = 0.0
-    """Mean length of a bad stretch, in which all is lost; 0: losses are independent."""
-    clear_loss_percent: float = 0.0  # Loss outside of bad stretches
-    reorder_percent: float = 0.0  # Share of messages held back, so that later ones can overtake
-    reorder_by_ms: float = 150.0  # The default lets one state of the control loop pass
-    order: str = FREE
-    """``kept``: no message overtakes, so a late message holds up all behind it, as TCP does."""
-    duplicate_percent: float = 0.0
-    """Share of messages that arrive twice; the copy's time under way is drawn anew."""
-    rate_kbps: float = 0.0  # Bandwidth in 1000 bit/s; 0: no limit
-    queue_ms: float = 200.0
-    """Longest wait for the line; a message that would wait longer is dropped."""
-    outages: tuple[Outage, ...] = ()
-
-    def __post_init__(self) -> None:
-        if not self.burst_messages:
-            return
-        clear, loss = self.clear_loss_percent, self.loss_percent
-        # Good stretches last one message at least, so bad ones cannot fill more than this.
-        most = self.burst_messages / (self.burst_messages + 1.0)
-        if not (clear <= loss and clear < 100.0 and self.bad_share <= most):
-            raise UserError(
-                f"loss {loss:g}% is impossible in bursts of {self.burst_messages:g} messages with"
-                f" {clear:g}% outside of them"
-            )
-
-    @property
-    def bad_share(self) -> float:
-        """Share of messages in bad stretches that makes the overall loss the asked one."""
-        return (self.loss_percent - self.clear_loss_percent) / (100.0 - self.clear_loss_percent)
-
-
-class Setting(NamedTuple):
-    """A setting of a specification, and how its value is read (ValueError if wrong)."""
-
-    field: str
-    example: str
-    read: Callable[[str], Any]
-
-
 _S = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 _MS = {"ms": 1.0, "us": 1e-3, "s": 1e3}
-_PERCENT = {"%": 1.0}
-_RATES = {"kbit/s": 1.0, "bit/s": 1e-3, "Mbit/s": 1e3, "Gbit/s": 1e6}
+_KBPS = {"kbit/s": 1.0, "bit/s": 1e-3, "Mbit/s": 1e3, "Gbit/s": 1e6}
 
 
 def _quantity(
@@ -130,29 +79,69 @@ def _read_outages(text: str) -> tuple[Outage, ...]:
     return tuple(windows)
 
 
-_ms, _percent = partial(_quantity, units=_MS), partial(_quantity, units=_PERCENT, most=100.0)
+_ms, _percent = partial(_quantity, units=_MS), partial(_quantity, units={"%": 1.0}, most=100.0)
 _messages = partial(_quantity, units={"": 1.0}, most=1e6, least=1.0)
-_kbps = partial(_quantity, units=_RATES, most=1e9, least=math.ulp(0.0))
-SETTINGS = {
-    "delay": Setting("delay_ms", "50ms", _ms),
-    "jitter": Setting("jitter_ms", "10ms", _ms),
-    "loss": Setting("loss_percent", "1%", _percent),
-    "tail": Setting("tail", "pareto", lambda word: TAILS[TAILS.index(word)]),
-    "burst": Setting("burst_messages", "5", _messages),
-    "clear_loss": Setting("clear_loss_percent", "0.1%", _percent),
-    "reorder": Setting("reorder_percent", "1%", _percent),
-    "reorder_by": Setting("reorder_by_ms", "300ms", _ms),
-    "order": Setting("order", KEPT, lambda word: ORDERS[ORDERS.index(word)]),
-    "duplicate": Setting("duplicate_percent", "1%", _percent),
-    "rate": Setting("rate_kbps", "1Mbit/s", _kbps),
-    "queue": Setting("queue_ms", "100ms", _ms),
-    "outage": Setting("outages", "0.5s@2s+0.2s/10s", _read_outages),
-}
-"""Name in a specification -> setting."""
+_kbps = partial(_quantity, units=_KBPS, most=1e9, least=math.ulp(0.0))
+
+
+def _setting(default: Any, name: str, example: str, read: Callable[[str], Any]) -> Any:
+    """Make a field that a specification sets as NAME=EXAMPLE; ``read`` raises ValueError."""
+    return field(default=default, metadata={"name": name, "example": example, "read": read})
+
+
+@dataclass(frozen=True)
+class DirectionSpec:
+    """One direction of the network. UserError for impossible bursts."""
+
+    # Mean time under way
+    delay_ms: float = _setting(0.0, "delay", "50ms", _ms)
+    # Standard deviation of the time under way; what falls below zero becomes zero
+    jitter_ms: float = _setting(0.0, "jitter", "10ms", _ms)
+    # Share of messages that never arrive, over good and bad stretches
+    loss_percent: float = _setting(0.0, "loss", "1%", _percent)
+    # Distribution of the time under way (`SHAPES`); mean and standard deviation stay
+    tail: str = _setting(NORMAL, "tail", PARETO, lambda word: TAILS[TAILS.index(word)])
+    # Mean length of a bad stretch, in which all is lost; 0: losses are independent
+    burst_messages: float = _setting(0.0, "burst", "5", _messages)
+    # Loss outside of bad stretches
+    clear_loss_percent: float = _setting(0.0, "clear_loss", "0.1%", _percent)
+    # Share of messages held back, so that later ones can overtake; the default lets one state pass
+    reorder_percent: float = _setting(0.0, "reorder", "1%", _percent)
+    reorder_by_ms: float = _setting(150.0, "reorder_by", "300ms", _ms)
+    # ``kept``: no message overtakes, so a late message holds up all behind it, as TCP does
+    order: str = _setting(FREE, "order", KEPT, lambda word: ORDERS[ORDERS.index(word)])
+    # Share of messages that arrive twice; the copy's time under way is drawn anew
+    duplicate_percent: float = _setting(0.0, "duplicate", "1%", _percent)
+    # Bandwidth in 1000 bit/s; 0: no limit
+    rate_kbps: float = _setting(0.0, "rate", "1Mbit/s", _kbps)
+    # Longest wait for the line; a message that would wait longer is dropped
+    queue_ms: float = _setting(200.0, "queue", "100ms", _ms)
+    outages: tuple[Outage, ...] = _setting((), "outage", "0.5s@2s+0.2s/10s", _read_outages)
+
+    def __post_init__(self) -> None:
+        if not self.burst_messages:
+            return
+        clear, loss = self.clear_loss_percent, self.loss_percent
+        # Good stretches last one message at least, so bad ones cannot fill more than this.
+        most = self.burst_messages / (self.burst_messages + 1.0)
+        if not (clear <= loss and clear < 100.0 and self.bad_share <= most):
+            raise UserError(
+                f"loss {loss:g}% is impossible in bursts of {self.burst_messages:g} messages with"
+                f" {clear:g}% outside of them"
+            )
+
+    @property
+    def bad_share(self) -> float:
+        """Share of messages in bad stretches that makes the overall loss the asked one."""
+        return (self.loss_percent - self.clear_loss_percent) / (100.0 - self.clear_loss_percent)
+
+
+SETTINGS = {each.metadata["name"]: each for each in fields(DirectionSpec)}
+"""Name in a specification -> field."""
 SHORT_GRAMMAR = "50ms+-10ms or delay=50ms,loss=1% (all settings: bridge/README.md)"
 GRAMMAR = (
     "none, 50ms+-10ms, or settings such as "
-    + ",".join(f"{name}={row.example}" for name, row in SETTINGS.items())
+    + ",".join(f"{name}={row.metadata['example']}" for name, row in SETTINGS.items())
     + ", each also with up. or down. before it"
 )
 
@@ -191,13 +180,13 @@ def parse_spec(text: str) -> LatencySpec:
             for name, word in pairs:
                 if name not in SETTINGS:
                     raise UserError(f"{part!r} is not understood; write {GRAMMAR}")
-                row = SETTINGS[name]
-                if row.field in given[prefix]:
+                row, about = SETTINGS[name].name, SETTINGS[name].metadata
+                if row in given[prefix]:
                     raise UserError(f"{name} is set twice")
                 try:
-                    given[prefix][row.field] = row.read(word)
+                    given[prefix][row] = about["read"](word)
                 except ValueError:
-                    raise UserError(f"{part!r}: write it like {name}={row.example}") from None
+                    raise UserError(f"{part!r}: write it like {name}={about['example']}") from None
         up, down = (DirectionSpec(**given[""] | given[way]) for way in DIRECTIONS)
         return LatencySpec(up, down, text)
     except UserError as error:

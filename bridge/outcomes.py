@@ -36,7 +36,6 @@ def outcome_of(info: Mapping[str, Any], only_truncated: bool = False) -> str:
 
 
 def is_told(outcomes: Iterable[str]) -> bool:
-    """Return whether any of the outcomes says something about success."""
     return not UNTOLD.issuperset(outcomes)
 
 
@@ -60,7 +59,6 @@ class Estimate(NamedTuple):
     size: int  # Values behind it
 
     def times(self, factor: float) -> Estimate:
-        """Multiply the number and its interval by a positive factor."""
         return Estimate(factor * self.value, factor * self.low, factor * self.high, self.size)
 
     def as_share(self) -> str:
@@ -91,7 +89,6 @@ def mean_estimate(values: Iterable[float]) -> Estimate:
 
 
 def success_estimate(successes: int, count: int) -> Estimate:
-    """Return the share of successes with Wilson's interval."""
     from scipy import stats
 
     interval = stats.binomtest(successes, count).proportion_ci(CONFIDENCE, method="wilson")

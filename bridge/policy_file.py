@@ -41,8 +41,6 @@ Act = Callable[[Arrays], np.ndarray]
 
 
 class Model(NamedTuple):
-    """A trained network that is to become a policy."""
-
     data: bytes  # ONNX
     algorithm: str = FOREIGN
     act: Act | None = None

@@ -25,12 +25,13 @@ import zenoh
 from bridge.environments import picture_of, say_once, scene_of
 from bridge.messages import DECODERS, SHADOW, TOKEN_TOPICS, Heard, Scene, encode_scene
 from bridge.network import SHORT_GRAMMAR, parse_spec
-from bridge.recording import RecordingWriter, new_recording, read_whole
+from bridge.recording import Recording, RecordingWriter, choose_vehicle, heard_of, new_recording
 from bridge.rerun import FOXGLOVE_PORT, SERVE, SPAWN
 from edge_runtime import cli
 from edge_runtime import tls as access
 from edge_runtime.files import check_writable
 from edge_runtime.manifest import Manifest
+from edge_runtime.sense import add_arguments as add_source
 from edge_runtime.tls import TlsFiles
 from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint, only_own, open_session, tls_for
 from edge_runtime.util import UserError, counted
@@ -174,7 +175,6 @@ class WireListener:
         self._is_stopped = True
 
     def next(self, timeout_s: float) -> Heard | None:
-        """Return the next message, or None after ``timeout_s``."""
         with contextlib.suppress(queue.Empty):
             return self.queue.get(timeout=timeout_s)
         return None
@@ -259,7 +259,9 @@ def open_source(arguments: Any) -> Iterator[Iterator[Heard | None]]:
     simulator goes; None where none comes for a moment.
     """
     if arguments.recording:
-        yield read_whole(arguments.recording, arguments.vehicle_id)
+        recording = Recording(Path(arguments.recording))
+        yield heard_of(recording, choose_vehicle(recording, arguments.vehicle_id))
+        recording.say_trouble()
         return
     where, vehicle_id = arguments.connect, arguments.vehicle_id or DEFAULT_VEHICLE_ID
     tls = tls_for(arguments.tls, where)
@@ -326,7 +328,11 @@ def wait_to_be_told(tls: TlsFiles | None = None) -> NoReturn:
             tls.require_valid(time.time())
 
 
-def _add_router_arguments(parser: Any) -> None:
+@cli.command(
+    "bridge.ports:run_router",
+    "python -m bridge router --listen tls/0.0.0.0:7447 --tls certs/router",
+)
+def router(parser: Any) -> None:
     listen = f"endpoint for all others; may be repeated (default: {DEFAULT_ENDPOINT})"
     vehicle = "with --tls: a vehicle whose parties have rights here; may be repeated"
     vehicle += f" (default: {DEFAULT_VEHICLE_ID})"
@@ -336,7 +342,7 @@ def _add_router_arguments(parser: Any) -> None:
     add_options(parser, "--vehicle-id", action="append", default=None, help=vehicle)
 
 
-def _run_router(arguments: Any) -> int:
+def run_router(arguments: Any) -> int:
     """Route until SIGTERM or ^C; without ``--tls``, everything that anybody sends."""
     listens, connect = arguments.listen or [DEFAULT_ENDPOINT], arguments.connect
     tls, rules = tls_for(arguments.tls, *listens, *[connect] * bool(connect)), None
@@ -353,11 +359,11 @@ def _run_router(arguments: Any) -> int:
     return 0
 
 
-ROUTER_EXAMPLE = "python -m bridge router --listen tls/0.0.0.0:7447 --tls certs/router"
-ROUTER = cli.Subcommand(cli.examples(ROUTER_EXAMPLE), _add_router_arguments, _run_router)
-
-
-def _add_record_arguments(parser: Any) -> None:
+@cli.command(
+    "bridge.ports:run_record",
+    "python -m bridge record --out car-a.mcap --vehicle-id car-a --wait-s 60",
+)
+def record(parser: Any) -> None:
     add, one = parser.add_argument, "record only this vehicle (default: all)"
     linger = "seconds to wait for a simulator that has left to come back"
     out = "recording to write; the file must not exist yet"
@@ -367,8 +373,7 @@ def _add_record_arguments(parser: Any) -> None:
     add("--linger-s", metavar="SECONDS", type=cli.seconds, default=LINGER_S, help=linger)
 
 
-def _run_record(arguments: Any) -> int:
-    """Record until the simulators go, or somebody interrupts."""
+def run_record(arguments: Any) -> int:
     tls = tls_for(arguments.tls, arguments.connect)
     path, vehicle_id = Path(arguments.out), arguments.vehicle_id or ANY_VEHICLE
     with (
@@ -397,10 +402,6 @@ def _listen(listener: WireListener, writer: RecordingWriter, linger_s: float) ->
         writer.write(heard, with_view=listener.queue.qsize() < QUEUE_MESSAGES // 2)
 
 
-RECORD_EXAMPLE = "python -m bridge record --out car-a.mcap --vehicle-id car-a --wait-s 60"
-RECORD = cli.Subcommand(cli.examples(RECORD_EXAMPLE), _add_record_arguments, _run_record)
-
-
 @cli.command(
     "bridge.rerun.draw:run",
     "python -m bridge view --serve",
@@ -414,8 +415,13 @@ def view(parser: Any) -> None:
     add_view(parser, " (the default)")
 
 
+sense = cli.command(
+    "edge_runtime.sense:run",
+    "python -m bridge sense --source my_camera:Camera --policy my.onnx --vehicle-id hunter01",
+)(add_source)
+
+
 def add_view(parser: Any, default: str = "") -> None:
-    """Add the options that say what is heard, and where it is shown."""
     add = parser.add_mutually_exclusive_group().add_argument
     kind: Any = {"dest": "sink", "action": "store_const"}
     add("--spawn", **kind, const=SPAWN, help=f"open a rerun window{default}")

@@ -55,15 +55,11 @@ class Recording:
         """The file has no end of its own: a kill, or damage beyond which nothing can be read."""
         self.damaged_places = 0  # Chunks that do not match their checksums
 
-    def trouble(self) -> str:
-        """Return what is wrong with the file, as a verb with its object; empty: nothing."""
-        if self.damaged_places:
-            return f"has {counted(self.damaged_places, 'damaged place')}"
-        return "was cut off" if self.cut_off else ""
-
     def say_trouble(self) -> None:
-        """Print the trouble, if any, in one line on stderr."""
-        if trouble := self.trouble():
+        trouble = "was cut off" if self.cut_off else ""
+        if self.damaged_places:
+            trouble = f"has {counted(self.damaged_places, 'damaged place')}"
+        if trouble:
             line = f"the recording {self.path} {trouble}; what is whole of it is taken"
             print(line, file=sys.stderr, flush=True)
 
@@ -138,18 +134,6 @@ def heard_of(recording: Recording, vehicle_id: str) -> Iterator[Heard]:
         if vehicle == vehicle_id:
             data = message.data
             yield Heard(channel.topic, topic, data, message.log_time, len(data))
-
-
-def read_whole(path: str, vehicle_id: str | None) -> Iterator[Heard]:
-    """Return the messages of one vehicle; at the end it prints what is wrong with the file."""
-    recording = Recording(Path(path))
-    vehicle_id = choose_vehicle(recording, vehicle_id)
-
-    def read() -> Iterator[Heard]:
-        yield from heard_of(recording, vehicle_id)
-        recording.say_trouble()
-
-    return read()
 
 
 def valid_messages(recording: Recording, vehicle_id: str) -> Iterator[tuple[Heard, Any]]:
@@ -276,7 +260,6 @@ ROAD_FRAME, EGO_FRAME = "road", "ego"  # Metres; x to the right, y up on the map
 
 
 def draw_road(scene: Scene, now: Any) -> Any:
-    """Return the road from above as a SceneUpdate: wide lines, one above the other."""
     strips: list[Any] = [
         *((points, view.ROAD, scene.road_width_m) for points in scene.roads),
         *((points, view.MARKING, 0.12) for points in scene.lane_lines),
@@ -335,7 +318,6 @@ class ViewerCopies:
         self._layouts: dict[str, Layout | None] = {}  # By the vehicle, as its scenes say
 
     def write(self, heard: Heard) -> None:
-        """Copy a message, or log an event about it."""
         if heard.topic in TOKEN_TOPICS:
             who = "edge runtime" if heard.topic == "alive" else "simulator"
             what = "is here" if heard.payload == b"\x01" else "has gone"
@@ -356,7 +338,6 @@ class ViewerCopies:
             self._copy_images(heard, message, layout)
 
     def _copy_road(self, heard: Heard, scene: Scene) -> None:
-        """Copy the road from above, if there is any, and where the ego car is."""
         now = _stamp(heard)
         if scene.roads or scene.vehicles:
             self._copy(heard, "road", draw_road(scene, now))

@@ -84,8 +84,7 @@ def run(arguments: Any) -> int:
     drive = RecordedDrive(Path(arguments.recording), arguments.vehicle_id)
     policy = load_policy(arguments.policy, arguments.public_key, arguments.allow_unsigned)
     config = load_config(arguments.config, {"policy": arguments.policy}, opens_link=False)
-    drawn: list[Drawn] = []
-    report = report_replay(drive, policy, config, arguments.tolerance, drawn)
+    report, drawn = report_replay(drive, policy, config, arguments.tolerance)
     write_json_out(arguments.out, report)
     if arguments.out:
         names = [row.name for row in policy.manifest.action]
@@ -104,25 +103,22 @@ def run(arguments: Any) -> int:
 
 
 def report_replay(
-    drive: RecordedDrive,
-    policy: Policy,
-    config: Config,
-    tolerance: float = DEFAULT_TOLERANCE,
-    drawn: list[Drawn] | None = None,
-) -> dict[str, Any]:
-    """Replay a drive and return the command's report; ``drawn`` takes what a picture shows.
+    drive: RecordedDrive, policy: Policy, config: Config, tolerance: float = DEFAULT_TOLERANCE
+) -> tuple[dict[str, Any], list[Drawn]]:
+    """Replay a drive; return the command's report, and what a picture shows.
 
     Raises UserError where nothing can be compared.
     """
+    compared, drawn = compare(replay(drive, policy, config), tolerance)
     report = {
         "recording": str(drive.recording.path),
         "policy_id": policy.policy_id,
         "recorded_policy_ids": sorted({each.command.policy_id for each in drive.answers.values()}),
-        **compare(replay(drive, policy, config), tolerance, drawn),
+        **compared,
     }
     if report["compared"] == 0:
         raise UserError(f"{drive.recording.path} holds no state with an answer of its policy")
-    return report
+    return report, drawn
 
 
 class RecordedDrive:
@@ -277,37 +273,35 @@ def _watchdog(controller: Controller, until_s: float) -> None:
         controller.tick(due_s + JUST_AFTER_S)
 
 
-def compare(
-    rows: Iterable[Row], tolerance: float, drawn: list[Drawn] | None = None
-) -> dict[str, Any]:
-    """Return the part of the report that says what differs, and append each pair to ``drawn``.
+def compare(rows: Iterable[Row], tolerance: float) -> tuple[dict[str, Any], list[Drawn]]:
+    """Return the part of the report that says what differs, and each pair of answers.
 
     States without a recorded answer are counted, not compared. Two answers are equal where mode
     and reason are, and no action, planned ones included, is further apart than ``tolerance``.
     """
-    kinds, unanswered, distances = Counter[str](), 0, [0.0]
+    kinds, unanswered, drawn = Counter[str](), 0, list[Drawn]()
     differences: list[dict[str, Any]] = []
     for state, recorded, order in rows:
         if recorded is None:
             unanswered += 1
             continue
         kinds[f"{recorded.mode}: {recorded.reason}".removesuffix(": ")] += 1
-        distances.append(distance := _distance(recorded, order))
-        if drawn is not None:
-            drawn.append((recorded.action, order.action if order else (), distance))
+        distance = _distance(recorded, order)
+        drawn.append((recorded.action, order.action if order else (), distance))
         if distance > tolerance:
             place = dict(zip(("session", "episode", "step"), key_of(state), strict=True))
             replayed = None if order is None else _told(order)
             differences.append({**place, "recorded": _told(recorded), "replayed": replayed})
-    return {
+    report = {
         "compared": kinds.total(),
         "unanswered": unanswered,
         "different": len(differences),
-        "largest_difference": max(filter(math.isfinite, distances)),
+        "largest_difference": max([0.0, *(d for *_, d in drawn if math.isfinite(d))]),
         "tolerance": tolerance,
         "by_recorded": dict(kinds),
         "first_differences": differences[:SHOWN_DIFFERENCES],
     }
+    return report, drawn
 
 
 def draw(drawn: Sequence[Drawn], names: Sequence[str], tolerance: float) -> Any:

@@ -144,10 +144,11 @@ class SafeStopLog:
             self.events.append(self._open)
 
 
-def quantiles(values_ms: Sequence[float]) -> dict[str, float | None]:
-    """Return p50, p99 and max of times in ms; None each if there are none."""
-    found = np.percentile(values_ms, [50, 99, 100]).tolist() if values_ms else [None] * 3
-    return dict(zip(("p50", "p99", "max"), found, strict=True))
+def percentiles(values: Sequence[float], **of: int) -> dict[str, float | None]:
+    """Return percentiles by name, as in ``p50=50``; None each if there are no values."""
+    return {
+        name: float(np.percentile(values, p)) if len(values) else None for name, p in of.items()
+    }
 
 
 def make_report(
@@ -165,7 +166,7 @@ def make_report(
     summary = summarise(results, facts["scenario"], facts["condition"], policy_id, facts["seed"])
     return {
         **summary,
-        "latency_ms": quantiles(latencies_ms),
+        "latency_ms": percentiles(latencies_ms, p50=50, p99=99, max=100),
         "answered_states": len(latencies_ms),
         **facts,
         "safe_stops": len(safe_stop_events),
@@ -239,7 +240,6 @@ class ProgressBar:
         self._bar.stop()
 
     def advance(self, figures: dict[str, str], count: int = 1) -> None:
-        """Count ``count`` more and show the figures."""
         self.done += count
         text = "  ".join(f"{name} {value}" for name, value in figures.items())
         self._bar.update(self._task, completed=self.done, figures=text)

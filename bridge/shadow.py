@@ -26,6 +26,7 @@ from bridge.messages import SHADOW, Heard
 from bridge.ports import add_options, add_view, open_source
 from bridge.recording import new_recording, whole_recording
 from bridge.replay import Key, key_of
+from bridge.report import percentiles
 from edge_runtime import cli, wire
 from edge_runtime.config import Config, add_trust, load_config
 from edge_runtime.controller import Controller, ControllerConfig, Order, Received, shared_limits
@@ -205,7 +206,7 @@ class Shadow:
         disagreement, largest_at = {}, {}
         for name, values in zip(names, rows.T[3:], strict=True):
             mean = float(values.mean()) if len(rows) else None
-            disagreement[name] = {"mean": mean, **_percentiles(values, p95=95, max=100)}
+            disagreement[name] = {"mean": mean, **percentiles(values, p95=95, max=100)}
             if len(rows):
                 episode, step, time_s = rows[values.argmax(), :3].tolist()
                 at = {"episode": int(episode), "step": int(step), "time_s": time_s}
@@ -219,11 +220,5 @@ class Shadow:
             "disagreement": disagreement,
             "largest_at": largest_at,
             "would_stop": dict(self._would_stop),
-            "inference_ms": _percentiles(np.array(self._inferences_ms), p50=50, p99=99),
+            "inference_ms": percentiles(self._inferences_ms, p50=50, p99=99),
         }
-
-
-def _percentiles(values: np.ndarray, **of: int) -> dict[str, float | None]:
-    return {
-        name: float(np.percentile(values, p)) if values.size else None for name, p in of.items()
-    }

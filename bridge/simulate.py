@@ -68,7 +68,6 @@ def add_arguments(parser: cli.ArgumentParser) -> None:
 
 
 def run(asked: Namespace) -> int:
-    """Open both ends of the loop, wait for an edge runtime and its vehicle, and drive."""
     if asked.loop == VEHICLE and asked.clock != REALTIME:
         raise UserError("--loop vehicle needs --clock realtime: a vehicle waits for no simulation")
     endpoint, wait_s = asked.connect or asked.listen, asked.wait_edge_s

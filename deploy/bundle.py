@@ -38,7 +38,7 @@ from edge_runtime.vehicles import vehicle_limits
 ROOT = Path(__file__).parents[1]
 NAME = "install.pyz"
 DEFAULT_OUT, KEPT_WHEELS = Path("build/bundles"), Path("build/wheels")
-_OF_THE_BUNDLE = {"policy", "tls", "public_key", "allow_unsigned", "hold"}
+_OF_THE_BUNDLE = {"policy", "tls", "public_key", "allow_unsigned", "armed_at_start"}
 _MAIN = """\
 import sys
 from deploy.installer.__main__ import main
@@ -88,10 +88,7 @@ def run_bundle(given: argparse.Namespace) -> int:
 
 
 def make_bundle(given: argparse.Namespace) -> tuple[Path, Manifest]:
-    """Write `phil-TARGET-VEHICLE-VERSION.tar`, mode 0600, and its signature into `out`.
-
-    `given` are the command's options. Raises UserError as `collect` does, with nothing written.
-    """
+    """Write `phil-TARGET-VEHICLE-VERSION.tar`, mode 0600, and its signature into `out`."""
     contents, manifest = collect(given)
     packed = pack(contents)
     path = given.out / f"phil-{given.target}-{manifest.vehicle_id}-{manifest.version}.tar"
@@ -101,11 +98,7 @@ def make_bundle(given: argparse.Namespace) -> tuple[Path, Manifest]:
 
 
 def collect(given: argparse.Namespace) -> tuple[dict[str, bytes], Manifest]:
-    """Return the files of a bundle, by path, and the manifest among them.
-
-    Raises UserError for a policy that may not drive or was not signed by the public key's owner,
-    settings that do not hold, certificates of another party, and a key that cannot sign.
-    """
+    """Return a bundle's files, by path, and its manifest. Raises UserError for what is wrong."""
     tls.read_signing_key(given.key)
     policy = load_policy(given.policy, given.public_key)
     flags = {"policy": str(given.policy), "tls": given.tls and str(given.tls)}
@@ -141,16 +134,18 @@ def collect(given: argparse.Namespace) -> tuple[dict[str, bytes], Manifest]:
 
 def _settings(config: Path | None, with_tls: bool) -> bytes:
     """Return the file that the board gets: the given settings behind those of the bundle."""
-    given = config.read_text("utf-8") if config else ""
-    if config and (wrong := _OF_THE_BUNDLE & read_toml(config, "config file").keys()):
+    given = read_toml(config, "config file") if config else {}
+    if wrong := [name for name in given if name in _OF_THE_BUNDLE and given[name] is not False]:
         raise UserError(f"config file {config}: leave {', '.join(wrong)} to the bundle")
     lines = [
         "# Made by `deploy bundle`; paths are of the release's folder, where the service starts.",
         f'policy = "{release.POLICY}"',
         f'public_key = "{release.PUBLIC_KEY}"',
-        'hold = "../../state/hold"  # locked while the installer judges; never armed at the start',
+        ""
+        if "armed_at_start" in given
+        else "armed_at_start = false  # nobody sees a service start",
         f'tls = "{release.TLS}"' if with_tls else "",
-        given,
+        config.read_text("utf-8") if config else "",
     ]
     return "\n".join(lines).encode()
 
@@ -177,7 +172,6 @@ def sign(data: bytes, key: Ed25519PrivateKey) -> bytes:
 
 
 def build_installer() -> bytes:
-    """Make `install.pyz`."""
     shared = (ROOT / f"edge_runtime/{name}.py" for name in ("__init__", "cli", "files", "util"))
     sources = [*(ROOT / "deploy/installer").glob("*.py"), *shared]
     return _zip(sources, {"__main__.py": _MAIN, "deploy/__init__.py": ""})
@@ -205,10 +199,7 @@ def lock_path(target: str) -> Path:
 
 
 def gather(target: str, place: str) -> None:
-    """Bring the lock's wheels to `place`, by way of the folder where they are kept.
-
-    pip checks every hash, and asks an index only where a wheel is missing.
-    """
+    """Bring the lock's wheels to `place`; an index is asked only for those that are not kept."""
     kept = str(KEPT_WHEELS / target)
     locked = ("--require-hashes", "--requirement", str(lock_path(target)), "--find-links", kept)
     try:
@@ -249,17 +240,14 @@ def push(parser: argparse.ArgumentParser) -> None:
 
 
 def run_push(given: argparse.Namespace) -> int:
-    """Copy and install over ssh; return the first status that is not 0.
-
-    The installer that runs there is this workstation's own: what verifies the bundle must not come
-    out of it.
-    """
+    """Copy and install over ssh; return the first status that is not 0."""
     # What the board would refuse is not sent.
     manifest, _ = release.read_bundle(given.bundle, release.read_public_key(given.trust))
     place = f"phil-push-{manifest.version}"
     install = ["sudo", "-n", f"python{manifest.python}", f"{place}/{NAME}", "install"]
     install += [f"{place}/{given.bundle.name}", "--trust", f"{place}/{given.trust.name}"]
     with tempfile.TemporaryDirectory() as folder:
+        # This workstation's own: what verifies the bundle must not come out of it.
         installer = Path(folder, NAME)
         installer.write_bytes(build_installer())
         # Absolute: scp would take "a:b" for a file of the host a.

@@ -53,10 +53,7 @@ def run_keys(arguments: argparse.Namespace) -> int:
 
 
 def write_key_pair(directory: Path) -> tuple[Path, Path]:
-    """Write `policy.key` (PKCS8 PEM, readable by the owner alone) and `policy.pub`.
-
-    Raises UserError where there is a key already, which may have signed policies that drive.
-    """
+    """Write `policy.key`, for the owner alone, and `policy.pub`; UserError where one is there."""
     public_path = directory / DEFAULT_PUBLIC_KEY.name
     private_path = public_path.with_suffix(".key")
     if private_path.exists() or public_path.exists():
@@ -78,8 +75,6 @@ def write_private(path: Path, data: bytes) -> None:
 
 
 class CertificatePair(NamedTuple):
-    """A certificate and its private key: a party's, or the authority's that makes others."""
-
     certificate: x509.Certificate
     key: ec.EllipticCurvePrivateKey
 
@@ -161,7 +156,6 @@ def _pem(key: ec.EllipticCurvePrivateKey | ed25519.Ed25519PrivateKey) -> bytes:
 
 
 def read_authority(folder: Path) -> CertificatePair:
-    """Read the authority that was made before. Raises UserError where its files do not fit."""
     pem = read_bytes(folder / tls.CA_FILE, "authority")
     key = tls.read_private_key(folder / CA_KEY_FILE)
     try:
@@ -181,10 +175,7 @@ def issue(
     now: datetime.datetime,
     days: int,
 ) -> CertificatePair:
-    """Make a party's key and certificate; without an authority, those of an authority.
-
-    `hosts` are the names under which a party that listens is reached.
-    """
+    """Make a party's key and certificate; without an authority, those of an authority."""
     key, is_authority = ec.generate_private_key(ec.SECP256R1()), authority is None
     uses: dict[str, Any] = {
         "digital_signature": not is_authority, "key_cert_sign": is_authority,

@@ -15,7 +15,7 @@ from typing import Any, Dict, List
 
 import msgspec
 
-from edge_runtime.cli import Subcommand, examples, program, run_cli
+from edge_runtime.cli import command, program, run_cli
 from edge_runtime.config import Config, add_flags, add_trust
 from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.link import ask, link_words
@@ -24,14 +24,9 @@ from edge_runtime.service import peak_memory_mb, quantiles_ms
 from edge_runtime.tls import OPERATOR, check_name, common_name
 from edge_runtime.transport import check_endpoint, tls_for
 from edge_runtime.util import UserError, printable
+from edge_runtime.watch import watch
 
 _RUNS, _FEWEST_RUNS, _MOST_S = 300, 20, 10.0  # Of a policy that is slow, fewer
-
-
-def _add_check(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("policy", metavar="POLICY.onnx", help="policy file to check")
-    parser.add_argument("--out", metavar="FILE.json", help="also write the report to this file")
-    add_trust(parser)
 
 
 def _check(arguments: argparse.Namespace) -> int:
@@ -65,16 +60,23 @@ def _check(arguments: argparse.Namespace) -> int:
     return 0
 
 
+_TRUSTED = "my.onnx \\\n    --public-key keys/policy.pub"
+
+
+@command(
+    _check,
+    f"python -m edge_runtime check {_TRUSTED}",
+    "python -m edge_runtime check my.onnx --allow-unsigned --out check.json",
+)
+def check(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("policy", metavar="POLICY.onnx", help="policy file to check")
+    parser.add_argument("--out", metavar="FILE.json", help="also write the report to this file")
+    add_trust(parser)
+
+
 def _add_operator(parser: argparse.ArgumentParser) -> None:
     add_flags(parser, "connect", "tls", "vehicle_id")
     parser.set_defaults(connect=Config().connect, vehicle_id=Config().vehicle_id)
-
-
-def _add_status(parser: argparse.ArgumentParser) -> None:
-    _add_operator(parser)
-    parser.add_argument("--out", metavar="FILE.json", help="write the whole status to this file")
-    text = "show once a second, until ^C, what matters beside the vehicle"
-    parser.add_argument("--watch", action="store_true", help=text)
 
 
 def _status(arguments: argparse.Namespace) -> int:
@@ -83,12 +85,22 @@ def _status(arguments: argparse.Namespace) -> int:
     look = partial(ask, arguments.connect, arguments.vehicle_id, "status", tls)
     reply = look()
     if arguments.watch:
-        from edge_runtime.watch import watch
-
         watch(look, reply)
     print(render_status(reply))
     write_json_out(arguments.out, reply)
     return 0
+
+
+@command(
+    _status,
+    "python -m edge_runtime status --connect tcp/10.0.0.2:7447 --vehicle-id hunter01",
+    "python -m edge_runtime status --watch",
+)
+def status(parser: argparse.ArgumentParser) -> None:
+    _add_operator(parser)
+    parser.add_argument("--out", metavar="FILE.json", help="write the whole status to this file")
+    text = "show once a second, until ^C, what matters beside the vehicle"
+    parser.add_argument("--watch", action="store_true", help=text)
 
 
 def _rearm(arguments: argparse.Namespace) -> int:
@@ -101,6 +113,12 @@ def _rearm(arguments: argparse.Namespace) -> int:
     print(f"{arguments.vehicle_id} is re-armed; it drives once 5 states in a row were fresh")
     return 0
 
+
+rearm = command(
+    _rearm,
+    "python -m edge_runtime rearm --connect tls/10.0.0.2:7447 \\\n"
+    "    --tls certs/operator-hunter01 --vehicle-id hunter01",
+)(_add_operator)
 
 _NOT_SHOWN = ("manifest", "schema", "sent_ns", "command", "feedback")
 
@@ -122,38 +140,13 @@ def _words(value: Any) -> str:
     return f"{value:.2f}" if isinstance(value, float) else str(value) or "none"
 
 
-_TRUSTED = "my.onnx \\\n    --public-key keys/policy.pub"
-CHECK = Subcommand(
-    examples(
-        f"python -m edge_runtime check {_TRUSTED}",
-        "python -m edge_runtime check my.onnx --allow-unsigned --out check.json",
-    ),
-    _add_check,
-    _check,
-)
-STATUS = Subcommand(
-    examples(
-        "python -m edge_runtime status --connect tcp/10.0.0.2:7447 --vehicle-id hunter01",
-        "python -m edge_runtime status --watch",
-    ),
-    _add_status,
-    _status,
-)
-REARM = Subcommand(
-    examples(
-        "python -m edge_runtime rearm --connect tls/10.0.0.2:7447 \\\n"
-        "    --tls certs/operator-hunter01 --vehicle-id hunter01",
-    ),
-    _add_operator,
-    _rearm,
-)
 COMMANDS = {
-    "check": (CHECK, "check whether a policy may drive, and measure its inference time"),
+    "check": (check, "check whether a policy may drive, and measure its inference time"),
     "run": ("edge_runtime.run", "drive a policy: answer each state of a simulator until ^C"),
     "sense": ("edge_runtime.sense", "send a source's observations in the simulator's place"),
     "jog": ("edge_runtime.jog", "try a vehicle step by step, its wheels up, before it drives"),
-    "status": (STATUS, "print the status of a running edge runtime"),
-    "rearm": (REARM, "let a vehicle drive again after a safe stop"),
+    "status": (status, "print the status of a running edge runtime"),
+    "rearm": (rearm, "let a vehicle drive again after a safe stop"),
 }
 main = program(
     "python -m edge_runtime",
@@ -166,9 +159,9 @@ main = program(
 
 
 def script() -> None:
-    status = run_cli(main)  # it has flushed what it printed
+    ended = run_cli(main)  # it has flushed what it printed
     # The interpreter's exit would wait for a thread that hangs, or that a driver left behind.
-    os._exit(status)
+    os._exit(ended)
 
 
 if __name__ == "__main__":

@@ -14,20 +14,10 @@ import sys
 import textwrap
 import threading
 import time
+from functools import partial
 from importlib import import_module
 from itertools import takewhile
-from typing import (
-    Any,
-    Callable,
-    Dict,
-    Iterable,
-    Iterator,
-    List,
-    NamedTuple,
-    NoReturn,
-    Optional,
-    Tuple,
-)
+from typing import Any, Callable, Iterable, Iterator, NamedTuple, NoReturn, Optional
 
 from edge_runtime import __version__
 from edge_runtime.util import UserError, printable
@@ -48,7 +38,7 @@ class HelpFormatter(argparse.ArgumentDefaultsHelpFormatter):
         # Examples are copied into a shell.
         return text if text.startswith("example") else super()._fill_text(text, width, indent)
 
-    def _split_lines(self, text: str, width: int) -> List[str]:
+    def _split_lines(self, text: str, width: int) -> list[str]:
         # A name that is broken at its hyphen cannot be copied.
         return textwrap.wrap(text, width, break_on_hyphens=False)
 
@@ -96,13 +86,8 @@ def examples(*commands: str) -> str:
 
 def add_public_key(parser: Any, more: str = "") -> None:
     """Add ``--public-key``, of every command that reads a policy, to a parser or group."""
-    parser.add_argument(
-        "--public-key",
-        metavar="FILE",
-        type="path",
-        help="Ed25519 public key (PEM) that verifies the signature (default: keys/policy.pub"
-        + f"{more})",
-    )
+    text = f"Ed25519 public key (PEM) that verifies the signature (default: keys/policy.pub{more})"
+    parser.add_argument("--public-key", metavar="FILE", type="path", help=text)
 
 
 class Subcommand(NamedTuple):
@@ -113,22 +98,22 @@ class Subcommand(NamedTuple):
     run: Callable[[argparse.Namespace], int]
 
 
-def command(place: str, *shown: str) -> Callable[[Callable[[Any], None]], Subcommand]:
-    """Decorate a function that adds options; `module:function` at `place` is loaded to run."""
-    text = examples(*shown)
-    return lambda add: Subcommand(text, add, lambda arguments: int(_load(place)(arguments)))
+def command(does: Any, *shown: str) -> Callable[[Callable[[Any], None]], Subcommand]:
+    """Decorate a function that adds options; `does` runs, or is `module:function` to load then."""
+    load = partial(_load, does) if isinstance(does, str) else lambda: does
+    return lambda add: Subcommand(examples(*shown), add, lambda given: int(load()(given)))
 
 
 def program(
-    name: str, description: str, commands: Dict[str, Tuple[Any, str]], *shown: str
-) -> Callable[[List[str]], int]:
+    name: str, description: str, commands: dict[str, tuple[Any, str]], *shown: str
+) -> Callable[[list[str]], int]:
     """Make the `main(argv)` that runs one of many commands. `shown` are examples for its help.
 
     `commands` has for each name a `Subcommand` and one line on what it does; or a place that is
     loaded only when it is asked for: `module:name` of a Subcommand, or a module that is like one.
     """
 
-    def main(argv: List[str]) -> int:
+    def main(argv: list[str]) -> int:
         parser = ArgumentParser(prog=name, description=description, epilog=examples(*shown))
         parser.add_argument("--version", action="version", version=__version__)
         parsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
@@ -152,11 +137,11 @@ def _load(place: str) -> Any:
     return getattr(found, name) if name else found
 
 
-def run_cli(main: Callable[[List[str]], int], argv: Optional[List[str]] = None) -> int:
+def run_cli(main: Callable[[list[str]], int], argv: Optional[list[str]] = None) -> int:
     """Run `main(argv)` and return its exit status; `argv` defaults to the command line.
 
     UserError and OSError, such as that of a full disk, become one line on stderr and status 2. ^C
-    is status 130; a reader that closed the pipe (`| head`) is 141. Use: `sys.exit(run_cli(main))`.
+    is status 130; a reader that closed the pipe (`| head`) is 141.
     """
     try:
         try:
@@ -211,11 +196,7 @@ seconds = number("a number of seconds from 0 to 1e9", lambda value: 0.0 <= value
 
 @contextlib.contextmanager
 def sigterm_as_interrupt() -> Iterator[None]:
-    """Raise KeyboardInterrupt in the block for SIGTERM and SIGHUP, too.
-
-    So sessions are closed and files are finished. A signal that has a handler keeps it. Outside of
-    the main thread it does nothing.
-    """
+    """Raise KeyboardInterrupt in the block for SIGTERM and SIGHUP, too, unless they are handled."""
     ends = (signal.SIG_DFL, signal.default_int_handler)
 
     def interrupt(number: int, frame: Any) -> NoReturn:
@@ -227,12 +208,8 @@ def sigterm_as_interrupt() -> Iterator[None]:
 
 @contextlib.contextmanager
 def quit_on_signals(ask: Callable[[], Optional[bool]]) -> Iterator[None]:
-    """Let the first signal ask for the end.
-
-    A second one ends the process, and so does the first where ``ask`` returns False: then nothing
-    is left that could end in order. Outside of the main thread it does nothing.
-    """
-    asked: List[int] = []
+    """Let the first signal `ask` for the end; a second one, or a False answer, ends the process."""
+    asked: list[int] = []
 
     def stop(number: int, frame: Any) -> None:
         asked.append(number)

@@ -51,7 +51,6 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     public_key: Optional[str] = None
     allow_unsigned: bool = False
     armed_at_start: bool = True
-    hold: Optional[str] = None
     ride_through: RideThrough = RideThrough()
     log_level: str = "info"
     max_speed_mps: Optional[float] = None
@@ -62,37 +61,25 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     @property
     def is_armed_at_start(self) -> bool:
-        """Whether a vehicle may drive at once.
-
-        Nobody sees what follows when a hold ends. And a start, which may be a service manager's,
-        gives no new leash: only a re-arm does.
-        """
-        return self.armed_at_start and self.hold is None and self.leash_m is None
+        """Whether a vehicle may drive at once. No start gives a new leash: only a re-arm does."""
+        return self.armed_at_start and self.leash_m is None
 
     @property
     def bounds(self) -> Bounds:
-        names = Bounds._fields
-        given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
-        return Bounds(**given)
+        given = {name: getattr(self, name) for name in Bounds._fields}
+        return Bounds(**{name: value for name, value in given.items() if value is not None})
 
 
 # The settings that are flags as well: metavar and help.
 _FLAGS: Dict[str, Tuple[str, str]] = {
     "policy": ("POLICY.onnx", "policy file to drive; its signature is POLICY.onnx.sig beside it"),
-    "connect": (
-        "PROTOCOL/HOST:PORT",
-        "endpoint of the simulator or router, for example tcp/10.0.0.2:7447",
-    ),
-    "tls": (
-        "DIR",
-        "folder of this party's certificate, from `deploy certs`; turns TLS on, so --connect must"
-        " be tls/HOST:PORT",
-    ),
+    "connect": ("PROTOCOL/HOST:PORT", "simulator or router, for example tcp/10.0.0.2:7447"),
+    "tls": ("DIR", "this party's certificate, from `deploy certs`; needs --connect tls/HOST:PORT"),
     "vehicle_id": ("ID", "id of the vehicle; simulator, runtime and operator must use the same"),
     "vehicle": (
         "NAME",
-        f"vehicle to move: {', '.join((NONE, *BUILT_IN))}, the name of an installed driver, or"
-        " your own as MODULE:CLASS; with none the runtime only answers the simulator",
+        f"vehicle to move: {', '.join((NONE, *BUILT_IN))}, an installed driver, or your own as"
+        " MODULE:CLASS; with none the runtime only answers the simulator",
     ),
     "bus": ("INTERFACE:CHANNEL", "CAN bus of --vehicle hunter, such as socketcan:can0"),
     "log_level": ("LEVEL", f"log events of this level or above: {', '.join(log.LEVELS)}"),
@@ -111,10 +98,8 @@ def add_flags(parser: Any, *names: str) -> None:
 
 def add_trust(parser: Any) -> None:
     """Add the flags that say which policy may drive to a parser or group."""
-    beside = "; with --allow-unsigned, policy.pub in the policy's folder comes first"
-    add_public_key(parser, beside)
-    text = "also drive a policy without a signature or without a known key; a wrong signature is "
-    text += "still refused"
+    add_public_key(parser, "; with --allow-unsigned, policy.pub in the policy's folder comes first")
+    text = "drive a policy without a signature or a known key; a wrong signature is still refused"
     parser.add_argument("--allow-unsigned", action="store_true", default=None, help=text)
 
 
@@ -153,7 +138,6 @@ def load_config(path: Optional[PathLike], flags: Dict[str, Any], opens_link: boo
     if bus is not None:
         if config.vehicle != "hunter":
             raise UserError(f"--bus needs --vehicle hunter; the vehicle is {config.vehicle}")
-        # The table is this config's own, and nobody has seen it.
         config.vehicle_settings.setdefault("hunter", {})["bus"] = bus
     return config
 

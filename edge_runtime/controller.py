@@ -38,11 +38,7 @@ Limits = Dict[str, ActionLimit]  # by the action's name
 
 
 def shared_limits(actions: Sequence[Action], vehicle: Limits) -> Limits:
-    """Cut the manifest's range to the vehicle's, for each action in the policy's order.
-
-    An empty table (no vehicle) leaves the manifest's range and any speed of change.
-    Raises UserError where a vehicle lacks an action of the policy.
-    """
+    """Cut the manifest's ranges to the vehicle's, in the policy's order. UserError: one lacks."""
     limits = {}
     for row in actions:
         if vehicle and row.name not in vehicle:
@@ -61,10 +57,7 @@ def shared_limits(actions: Sequence[Action], vehicle: Limits) -> Limits:
 def limit_action(
     wanted: Sequence[float], last: Sequence[float], limits: Limits, elapsed_s: float
 ) -> List[float]:
-    """Clamp `wanted` to each range, and to the change from `last` that `elapsed_s` allows.
-
-    A limit that does not bite leaves the number as it is, to the last bit.
-    """
+    """Clamp `wanted` to each range, and to the change from `last` that `elapsed_s` allows."""
     limited = []
     for value, previous, limit in zip(wanted, last, limits.values()):
         if limit.slew_per_s < math.inf:
@@ -106,10 +99,7 @@ class Ride:
         self._next_s = math.inf
 
     def begin(self, wanted: List[float], action: List[float], now_s: float) -> List[List[float]]:
-        """Plan the actions after the command `action`, on towards what the policy `wanted`.
-
-        Each action is limited like the command's own.
-        """
+        """Plan what follows the command `action`, on towards `wanted`, limited like it."""
         plan = []
         for _ in range(self.periods):
             action = limit_action(wanted, action, self._limits, self._period_s)
@@ -132,15 +122,11 @@ class Ride:
         return action
 
     def end(self) -> None:
-        """Forget the plan: there is a stop."""
         self._left = []
 
 
 class Received(NamedTuple):
-    """An accepted state with the time of its arrival, monotonic and wall clock.
-
-    `follows_final`: it has taken the place of a final state that nobody answered.
-    """
+    """An accepted state and its arrival. `follows_final`: of a final state that nobody answered."""
 
     state: State
     arrived_s: float
@@ -149,12 +135,9 @@ class Received(NamedTuple):
 
     @property
     def trip_s(self) -> Optional[float]:
-        """How long the newest command that the sender had heard, and this state, were under way.
-
-        None where the sender does not say. The stamps of each clock are subtracted first: two of
-        different clocks may be decades apart.
-        """
+        """Round trip of the newest command heard, and this state; None where nobody tells it."""
         heard_sent_ns, heard_ns = self.state.heard_sent_ns, self.state.heard_ns
+        # The stamps of each clock first: two of different clocks may be decades apart.
         if isinstance(heard_sent_ns, int) and isinstance(heard_ns, int):
             held_ns = self.state.sent_ns - heard_ns
             return (self.arrived_ns - heard_sent_ns - held_ns) * 1e-9
@@ -209,8 +192,8 @@ class ControllerConfig(NamedTuple):
 class Controller:
     """One state at a time: `begin` when the policy starts on it, `finish` with its answer.
 
-    `tick` is called at `next_deadline_s` and gives the orders that time alone causes. Raises
-    UserError where no plan can be as long as `ride_s`.
+    `tick` is called at `next_deadline_s` and gives the orders that time alone causes. UserError
+    where no plan can be as long as `ride_s`.
     """
 
     def __init__(self, config: ControllerConfig) -> None:
@@ -240,7 +223,6 @@ class Controller:
 
     @property
     def waits_for_rearm(self) -> bool:
-        """Whether only an operator can let it drive again."""
         stopped = self.safety.mode is Mode.SAFE_STOP
         return self._needs_rearm and stopped and not self.safety.rearmed
 
@@ -275,10 +257,7 @@ class Controller:
     def finish(
         self, output: Optional[np.ndarray], inference_ns: int, now_s: float
     ) -> Optional[Order]:
-        """Order what the policy answers to the state of `begin`; None where it came too late.
-
-        An answer that is not float32 [n], or None, is a failed inference.
-        """
+        """Order what the policy answers; None where it came too late. No `output`: it failed."""
         if self._begun_s is None or self._newest is None:
             return None
         overdue = now_s - self._begun_s > self._period_s
@@ -399,10 +378,7 @@ class Controller:
         return rules.classify_fresh(self.safety, state.final, self._needs_rearm)
 
     def _begins_episode(self, received: Received) -> bool:
-        """Return whether a vehicle needs a permission for this state's episode.
-
-        Not by the number alone: a simulator may give each episode the same.
-        """
+        """Return whether a vehicle needs a permission for this episode; its number may repeat."""
         before, now = self._newest, received.state
         if not self.each_episode or before is None:
             return False

@@ -39,10 +39,7 @@ def write_atomic(path: PathLike, data: bytes | memoryview) -> None:
 
 
 def check_writable(path: Optional[PathLike]) -> Optional[PathLike]:
-    """Return the absolute path; UserError now if `write_json_out(path)` would fail later.
-
-    It makes no directory: a command that is refused for another reason leaves nothing behind.
-    """
+    """Return the absolute path; UserError now if `write_json_out(path)` would fail later."""
     if path is None:
         return None
     target = _checked(path)

@@ -101,11 +101,7 @@ class Link:
         ]
 
     def appear(self, open_client: OpenClient, stop: Callable[[], None]) -> None:
-        """Show that it is alive, and look for others with this vehicle id.
-
-        It gives way to an elder one: it sends nothing more, and calls `stop`. `stop` is called,
-        too, when its certificate has expired.
-        """
+        """Show that it is alive. Call `stop` for an elder one, or an expired certificate."""
 
         def give_way() -> None:
             self.gave_way = True
@@ -119,7 +115,6 @@ class Link:
 
     @property
     def rivals(self) -> int:
-        """How many other runtimes were seen under this vehicle id."""
         return self._presence.rivals if self._presence else 0
 
     def send(self, topic: str, message: Message) -> None:
@@ -183,7 +178,6 @@ def require_free(open_client: OpenClient, vehicle_id: str) -> None:
 
 
 def taken(vehicle_id: str) -> UserError:
-    """Make the error of a runtime that must give way."""
     found = f"another edge runtime is connected with vehicle id {vehicle_id}"
     return UserError(f"{found}; end that one first")
 
@@ -215,20 +209,19 @@ class Presence:
         self._stopping = threading.Event()
         self.thread = threading.Thread(target=self._run, name="presence", daemon=True)
 
-    def refresh(self) -> bool:
+    def refresh(self) -> None:
         """Declare the tokens again if other routers are there than the last time."""
         routers = self._seen_routers()
         if routers and routers != self._routers:
             if self._listener:
                 self._listener.look()  # before anybody sees the tokens, and sends
             self._declare()  # it is tried again where this fails
-            self._routers = routers
-            return True
         self._routers = routers
-        return False
 
     def look(self) -> None:
         """Look for other claims; give way to an elder one that is seen for the second time."""
+        pause_s = _FIRST_LOOKS_S if self._seen_before is None else _LOOK_S
+        self._look_at_s = time.monotonic() + pause_s
         found = _ask(self._open_client, f"{self._key}/*")
         claims = {key.rsplit("/", 1)[1] for key in found} - {self.claim}
         seen_twice = claims & (self._seen_before or set())
@@ -236,7 +229,6 @@ class Presence:
             self._known.add(claim)
             self.rivals += 1
             log.event("error", "another_edge", claim=claim, elder=claim < self.claim)
-        self._pause_s = _FIRST_LOOKS_S if self._seen_before is None else _LOOK_S
         self._seen_before = claims
         if any(claim < self.claim for claim in seen_twice):
             self._give_way()
@@ -252,7 +244,7 @@ class Presence:
         self._take_back()
         # Wall clock, because two boards compare it; the rest tells two of one moment apart.
         self.claim = f"{time.time_ns():016x}-{os.urandom(4).hex()}"
-        self._seen_before, self._pause_s = None, _FIRST_LOOKS_S
+        self._seen_before, self._look_at_s = None, time.monotonic() + _FIRST_LOOKS_S
         for token in (self._key, f"{self._key}/{self.claim}"):
             self._tokens.append(self._session.liveliness().declare_token(token))
 
@@ -264,13 +256,10 @@ class Presence:
         return sorted(map(str, self._session.info.routers_zid()))
 
     def _run(self) -> None:
-        looked_s = time.monotonic()
         while not self._stopping.wait(_POLL_S):
             try:
-                if self.refresh():
-                    looked_s = time.monotonic()
-                if self._routers and time.monotonic() >= looked_s + self._pause_s:
-                    looked_s = time.monotonic()
+                self.refresh()
+                if self._routers and time.monotonic() >= self._look_at_s:
                     if self._listener and self._listener.refusal(time.time()):
                         self._listener.look()
                     self.look()
@@ -294,10 +283,7 @@ def _ask(open_client: OpenClient, selector: str) -> List[str]:
 def ask(
     connect: str, vehicle_id: str, topic: str, tls: Optional[TlsFiles] = None
 ) -> Dict[str, Any]:
-    """Query a runtime for its JSON reply. Raises UserError where none comes in 2 s.
-
-    `topic` is "status" or "rearm".
-    """
+    """Query a runtime's "status" or "rearm" for its JSON; UserError where none comes in 2 s."""
     selector = key(vehicle_id, topic)
     with open_session(connect=connect, mode="client", tls=tls) as session:
         for reply in session.get(selector, timeout=2.0):
@@ -354,8 +340,6 @@ class _Way:
 
 
 class LinkQuality:
-    """Measures the link by each accepted state and each command that is sent."""
-
     def __init__(self) -> None:
         self._begin("")
 
@@ -420,13 +404,16 @@ def is_poor(link: Mapping[str, float], control_period_s: float, was_poor: bool =
     return max(late, lost) > (GOOD_AGAIN if was_poor else 1.0)
 
 
-def link_words(link: Mapping[str, float]) -> str:
-    """Render the link for a person; that of another version, with other fields, is not known."""
+def link_rows(link: Mapping[str, float]) -> Dict[str, str]:
+    """Render each way for a person; that of another version, with other fields, is not known."""
     if not link.keys() >= set(FIELDS):
-        return "not known yet"
-    ways = (
-        f"{way} {link[f'{way}_ms']:.1f} ms, jitter {link[f'{way}_jitter_ms']:.1f},"
-        f" {link[f'{way}_lost_percent']:.1f} % lost"
+        return {"link": "not known yet"}
+    return {
+        f"link {way}": f"{link[f'{way}_ms']:.1f}+-{link['error_ms']:.1f} ms,"
+        f" jitter {link[f'{way}_jitter_ms']:.1f}, {link[f'{way}_lost_percent']:.1f}% lost"
         for way in ("up", "down")
-    )
-    return f"{'; '.join(ways)}; delays +-{link['error_ms']:.1f} ms"
+    }
+
+
+def link_words(link: Mapping[str, float]) -> str:
+    return "; ".join(f"{way} {words}" for way, words in link_rows(link).items())

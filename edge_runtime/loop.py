@@ -18,7 +18,7 @@ import threading
 import time
 import traceback
 from collections import deque
-from typing import TYPE_CHECKING, Any, Deque, Dict, Optional
+from typing import Any, Deque, Dict, Optional
 
 from edge_runtime import log
 from edge_runtime.controller import Controller, Order, Received
@@ -26,11 +26,9 @@ from edge_runtime.latest import LatestState
 from edge_runtime.link import Link, LinkQuality, is_poor, link_words
 from edge_runtime.policy import Policy, infer
 from edge_runtime.safety import Event, Mode
-from edge_runtime.service import WINDOW, BoardWatch, Hold, Notifier, quantiles_ms
+from edge_runtime.service import WINDOW, BoardWatch, Notifier, quantiles_ms
+from edge_runtime.vehicles.base import VehicleRunner
 from edge_runtime.wire import HEALTH_HZ, MAX_TEXT_CHARS, Health, Rejection, is_foreign
-
-if TYPE_CHECKING:  # Loaded only where there is a vehicle.
-    from edge_runtime.vehicles.base import VehicleRunner
 
 _HEALTH_PERIOD_S = 1.0 / HEALTH_HZ
 _JOIN_S = 0.5
@@ -41,10 +39,7 @@ _HUNG_S = 2.0
 
 
 class ControlLoop:
-    """Answers states with commands until it is stopped.
-
-    `rearm_command` is what the log names to an operator.
-    """
+    """Answers states with commands until it is stopped; the log names `rearm_command`."""
 
     def __init__(
         self,
@@ -53,11 +48,10 @@ class ControlLoop:
         link: Link,
         notifier: Notifier,
         vehicle: Optional[VehicleRunner] = None,
-        hold: Optional[Hold] = None,
         rearm_command: str = "",
     ) -> None:
         self._policy, self._controller, self._link = policy, controller, link
-        self._vehicle, self._notifier, self._hold = vehicle, notifier, hold
+        self._vehicle, self._notifier = vehicle, notifier
         self._rearm_command = rearm_command
         self._period_s = policy.manifest.control_period_s
         self._link_quality, self._is_poor = LinkQuality(), False
@@ -91,8 +85,7 @@ class ControlLoop:
     def run(self) -> None:
         """Be the watchdog until `stop` is called."""
         next_health_s = time.monotonic()
-        alive_period_s = self._notifier.watchdog_period_s
-        next_alive_s = next_health_s if alive_period_s else math.inf
+        next_alive_s = next_health_s
         with self._lock:
             while not self._stopping:
                 now_s = time.monotonic()
@@ -103,9 +96,9 @@ class ControlLoop:
                     self._link.send("health", health)
                     self._log_link(health.link)
                     next_health_s = max(next_health_s + _HEALTH_PERIOD_S, now_s)
-                if alive_period_s and now_s >= next_alive_s and not self._is_hung(now_s):
+                if now_s >= next_alive_s and not self._is_hung(now_s):
                     self._notifier.tell("WATCHDOG=1")
-                    next_alive_s = now_s + alive_period_s
+                    next_alive_s = now_s + self._notifier.watchdog_period_s
                 self._sleep(min(next_health_s, max(next_alive_s, now_s + _RETRY_S)))
 
     def stop(self) -> None:
@@ -130,7 +123,6 @@ class ControlLoop:
         return bool(self._latest.accepted or self._latest.rejected)
 
     def health(self) -> Health:
-        """Make the message of the health topic and of the status query."""
         with self._lock:
             safety = self._controller.safety
             return Health(
@@ -157,7 +149,6 @@ class ControlLoop:
             )
 
     def _bounds(self) -> Dict[str, Any]:
-        """Return the fields of health about the operator's bounds; None: none is set."""
         if self._vehicle is None:
             return {}
         found = {**self._vehicle.allowed._asdict(), "leash_left_m": self._vehicle.leash.left_m}
@@ -244,8 +235,7 @@ class ControlLoop:
             if self._vehicle is not None:
                 # A fault whose cause is over ends with `enable`; the next look shows it.
                 self._controller.vehicle_fault = self._vehicle.standing_fault(now_s)
-            refusal = self._hold.refusal() if self._hold is not None else ""
-            refusal = refusal or self._controller.rearm(now_s)
+            refusal = self._controller.rearm(now_s)
             if not refusal and self._vehicle is not None:
                 self._vehicle.enable()
             log.event("info", "rearm", accepted=not refusal, detail=refusal)
@@ -265,7 +255,7 @@ class ControlLoop:
 
     def _send(self, order: Optional[Order]) -> None:
         self._log_transition()
-        if order is None or (self._hold is not None and self._hold.is_on()):
+        if order is None:
             return
         command = order.command(self._policy.policy_id, time.time_ns())
         if not order.ridden:

@@ -13,17 +13,9 @@ from typing import Any, Dict, List, Mapping, NamedTuple, Optional, Tuple, Union
 import msgspec
 import numpy as np
 
+from edge_runtime import wire
 from edge_runtime.util import UserError
-from edge_runtime.wire import (
-    MAX_STATE_BYTES,
-    MAX_TEXT_CHARS,
-    Reason,
-    Rejection,
-    State,
-    Versioned,
-    decode_state,
-    is_foreign,
-)
+from edge_runtime.wire import MAX_STATE_BYTES, MAX_TEXT_CHARS, Reason, Rejection, State
 
 MANIFEST_KEY = "phil.manifest"
 MANIFEST_SCHEMA = 2
@@ -129,7 +121,7 @@ def decode_manifest(text: str) -> Manifest:
     """Decode the manifest of a policy file. Raises UserError where no policy could drive by it."""
     try:
         # The schema first: another schema's fields need not fit.
-        schema = msgspec.json.decode(text.encode(), type=Versioned).schema
+        schema = msgspec.json.decode(text.encode(), type=wire.Versioned).schema
         if schema != MANIFEST_SCHEMA:
             found = f"the manifest has schema {schema}, this runtime reads {MANIFEST_SCHEMA}"
             raise UserError(f"{found}; export the policy again")
@@ -192,13 +184,9 @@ class Layout:
             raise UserError(f"{found}; the wire carries {MAX_STATE_BYTES - OVERHEAD_BYTES} at most")
 
     def decode(self, payload: bytes) -> Union[State, Rejection]:
-        """Decode a State with finite numbers whose observation is this task's.
-
-        A state that names another task is handed on as it is, so that its sender can be told; the
-        policy must not see it.
-        """
-        state = decode_state(payload, self.max_payload_bytes)
-        if isinstance(state, Rejection) or is_foreign(state, self.task_text):
+        """Decode a state of this task. One of another task passes: its sender is to be told."""
+        state = wire.decode_state(payload, self.max_payload_bytes)
+        if isinstance(state, Rejection) or wire.is_foreign(state, self.task_text):
             return state
         return self.refusal(state.observation) or state
 

@@ -86,10 +86,7 @@ def load_policy(
 def load_manifest(
     path: PathLike, public_key: Optional[PathLike] = None, allow_unsigned: bool = False
 ) -> Manifest:
-    """Read the manifest of a trusted policy; its network, and onnxruntime, are not loaded.
-
-    Raises UserError as `load_policy` does.
-    """
+    """Read a trusted policy's manifest, without its network. Raises as `load_policy` does."""
     data = read_bytes(path, "policy file", MAX_POLICY_MIB)
     check_trust(path, data, public_key, allow_unsigned)
     try:
@@ -181,10 +178,7 @@ def _flushed() -> Iterator[None]:
 
 
 def probes(layout: Layout) -> Iterator[dict[str, np.ndarray]]:
-    """Make the observations that a policy must answer first: zeros, middling values, seeded noise.
-
-    Bytes over their range, floats from 0 to 1, integers 0 and 1.
-    """
+    """Make what a policy must answer first: zeros, middling values, seeded noise, each in range."""
     random = np.random.RandomState(0)
     for make in (np.zeros, lambda shape: np.full(shape, 0.5), random.random_sample):
         yield {
@@ -312,11 +306,7 @@ _OPERATORS: tuple[tuple[str, Optional[slice], tuple[str, ...]], ...] = (
 
 
 def check_graph(data: bytes) -> dict[str, str]:
-    """Check a whole ONNX file, which onnxruntime does not, and return its metadata.
-
-    Raises UserError for truncated or foreign bytes, for weights anywhere but in plain tensors
-    inside the file, for a refused operator, and for another IR version or operator set.
-    """
+    """Check an ONNX file, which onnxruntime does not; return its metadata. Raises UserError."""
     try:
         model = _checked(memoryview(data), "model")
         # A protobuf library would merge two graphs into one that was not looked at here.

@@ -1,7 +1,4 @@
-"""Why there is no link, the far end's certificate, and ports to listen at.
-
-All of it with Python's own socket and ssl.
-"""
+"""Why there is no link, the far end's certificate, and a free port: Python's own socket and ssl."""
 
 from __future__ import annotations
 
@@ -9,24 +6,20 @@ import contextlib
 import math
 import socket
 import ssl
-from typing import Any, List, Optional, Tuple
+from collections import deque
+from typing import Any, Deque, Optional, Tuple
 
 from edge_runtime.tls import TlsFiles
-from edge_runtime.util import UserError
 from edge_runtime.wire import Reason, Rejection
 
 _LOOK_S = 1.0
 # A server that refuses a client's certificate says so after the handshake (TLS 1.3).
 _ALERT_S = 0.3
-_KEPT: List[socket.socket] = []
-_MOST_KEPT = 100
+_KEPT: Deque[socket.socket] = deque(maxlen=100)  # a long campaign would run out of open files
 
 
 def why_no_link(endpoint: str, files: Optional[TlsFiles]) -> Tuple[bool, str]:
-    """Return whether anybody answers at `endpoint`, and the error of a link; "" if there is none.
-
-    Zenoh says "Unable to connect" for every cause. Of udp this knows nothing.
-    """
+    """Return whether anybody answers at `endpoint`, and why there is no link; "" if there is."""
     protocol, host, port = _parts(endpoint)
     answers = False
     try:
@@ -57,8 +50,7 @@ def _context(files: TlsFiles) -> ssl.SSLContext:
 class Listener:
     """The far end of a TLS link, and until when its certificate and our own hold.
 
-    Zenoh closes a link when the far end's expires, and opens it again within 0.2 s: TLS believes
-    the certificate to the end of the second, and the new link stays.
+    Zenoh closes a link whose certificate expires, and lets a new one in before the second is over.
     """
 
     def __init__(self, endpoint: str, files: TlsFiles) -> None:
@@ -90,32 +82,12 @@ class Listener:
             self._why = f"expired at {shown['notAfter']}"
 
 
-def check_port_is_free(endpoint: str) -> None:
-    """Raise UserError where nothing can listen at an endpoint."""
-    protocol, host, port = _parts(endpoint)
-    kind = socket.SOCK_DGRAM if protocol == "udp" else socket.SOCK_STREAM
-    try:
-        family, _, _, _, target = socket.getaddrinfo(host, port, type=kind)[0]
-        with socket.socket(family, kind) as probe:
-            # As the listener does: the last run's closed links are no bar.
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, int(protocol != "udp"))
-            probe.bind(target)
-    except (OSError, UnicodeError) as error:
-        what = f"cannot listen at {endpoint} ({error})"
-        raise UserError(f"{what}; choose another with --listen") from None
-
-
 def free_endpoint(protocol: str = "tcp") -> str:
-    """Return a Zenoh endpoint on loopback that nobody listens on, for demos and tests.
-
-    The port stays reserved until this process ends or has asked for a hundred more.
-    """
+    """Return a free endpoint on loopback, and reserve it: for demos and tests."""
     probe = socket.socket()
     probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # One may listen there all the same
     probe.bind(("127.0.0.1", 0))
     _KEPT.append(probe)
-    if len(_KEPT) > _MOST_KEPT:  # A long campaign would run out of open files.
-        _KEPT.pop(0).close()
     return f"{protocol}/127.0.0.1:{probe.getsockname()[1]}"
 
 

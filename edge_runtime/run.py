@@ -9,10 +9,9 @@ import signal
 import threading
 import time
 from functools import partial
-from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Union
+from typing import Any, List, Optional, Union
 
 from edge_runtime import log, service
-from edge_runtime.bounds import narrowed
 from edge_runtime.cli import ENDING_SIGNALS, handled
 from edge_runtime.config import EACH_EPISODE, NONE, Config, add_run_flags, load_config
 from edge_runtime.controller import Controller, ControllerConfig, shared_limits
@@ -23,10 +22,8 @@ from edge_runtime.reach import Listener, why_no_link
 from edge_runtime.tls import EDGE, TlsFiles, check_name, common_name, load_tls, rules_for_edge
 from edge_runtime.transport import open_session, rearm_command
 from edge_runtime.util import PathLike, ends_within, printable
-
-if TYPE_CHECKING:  # Loaded only where there is a vehicle.
-    from edge_runtime.vehicles.base import Vehicle, VehicleRunner
-
+from edge_runtime.vehicles import check_driver, find_vehicle, make_vehicle
+from edge_runtime.vehicles.base import Vehicle, VehicleRunner, close_in_time
 
 _ANNOUNCE_S, _CLOSE_S = 0.5, 2.0
 _WAITING_PERIOD_S = 10.0
@@ -66,41 +63,27 @@ def drive(
     """
     driver = None if vehicle is None or isinstance(vehicle, str) else vehicle
     flags = {"policy": policy and str(policy), "connect": connect, **settings}
-    stop = _Stop()
+    runtime: Optional[_Runtime] = None
+
+    def end(number: int, frame: Any) -> None:
+        if runtime is None:
+            raise KeyboardInterrupt
+        runtime.stop()
+
     try:
         # `unbuilt` closes what a build that fails has opened.
-        with handled(ENDING_SIGNALS, stop.by_signal), contextlib.ExitStack() as unbuilt:
+        with handled(ENDING_SIGNALS, end), contextlib.ExitStack() as unbuilt:
             if driver is not None:
-                from edge_runtime.vehicles import check_driver
-
                 check_driver(driver)
-                _close_unless_built(driver, unbuilt)
+                unbuilt.callback(close_in_time, driver)
             loaded = load_config(config, {**flags, "vehicle": vehicle if driver is None else NONE})
             log.configure(loaded.log_level)
             runtime = _Runtime(loaded, driver, unbuilt)
             unbuilt.pop_all()
-            ended = runtime.run(stop, until)
+            ended = runtime.run(until)
     finally:
         written = log.close()
     return ended and written
-
-
-class _Stop:
-    """Ends the drive at a signal; before there is one, the signal is ^C."""
-
-    def __init__(self) -> None:
-        self.on_stop: Optional[Callable[[], None]] = None
-
-    def by_signal(self, number: int, frame: Any) -> None:
-        if self.on_stop is None:
-            raise KeyboardInterrupt
-        self.on_stop()
-
-
-def _close_unless_built(vehicle: Vehicle, unbuilt: contextlib.ExitStack) -> None:
-    from edge_runtime.vehicles.base import close_in_time
-
-    unbuilt.callback(close_in_time, vehicle)
 
 
 class _Runtime:
@@ -111,26 +94,23 @@ class _Runtime:
     ) -> None:
         self._config = config
         self._tls: Optional[TlsFiles] = None
-        access: Optional[Dict[str, Any]] = None
         if config.tls is not None:
-            self._tls, access = load_tls(config.tls), rules_for_edge(config.vehicle_id)
+            self._tls = load_tls(config.tls)
             name, expires = self._tls.name, self._tls.expires
             check_name(name, common_name(EDGE, config.vehicle_id))
             log.event("info", "certificate", of=name, expires=f"{expires:%Y-%m-%dT%H:%MZ}")
         if config.vehicle != NONE:
-            from edge_runtime.vehicles import find_vehicle, make_vehicle
-
             find_vehicle(config.vehicle)  # now: a misprint need not wait for the policy
         self._policy = load_policy(str(config.policy), config.public_key, config.allow_unsigned)
         manifest = self._policy.manifest
         if config.vehicle != NONE:
             vehicle = make_vehicle(config.vehicle, config.vehicle_settings, manifest)
-            _close_unless_built(vehicle, unbuilt)
+            unbuilt.callback(close_in_time, vehicle)
         if vehicle is not None:
             vehicle.take_bounds(config.bounds)
         controller = _controller(config, self._policy, vehicle)
-        hold = None if config.hold is None else service.Hold(config.hold)
         # Both sessions hear only what this vehicle's edge may hear.
+        access = None if self._tls is None else rules_for_edge(config.vehicle_id)
         connected = partial(open_session, connect=config.connect, tls=self._tls, access=access)
         self._open_client = partial(connected, mode="client")
         require_free(self._open_client, config.vehicle_id)
@@ -140,31 +120,20 @@ class _Runtime:
         self._link = Link(self._session, config.vehicle_id, manifest, listener)
         self._vehicle: Optional[VehicleRunner] = None
         if vehicle is not None:
-            from edge_runtime.vehicles.base import VehicleRunner
-
             names = [row.name for row in manifest.action]
             self._vehicle = VehicleRunner(vehicle, names, partial(self._link.send, "feedback"))
         self._notifier = service.Notifier()
-        self._loop = ControlLoop(
-            self._policy,
-            controller,
-            self._link,
-            self._notifier,
-            vehicle=self._vehicle,
-            hold=hold,
-            rearm_command=rearm_command(config.connect, config.vehicle_id, self._tls),
-        )
+        hint = rearm_command(config.connect, config.vehicle_id, self._tls)
+        parts = (self._policy, controller, self._link, self._notifier, self._vehicle, hint)
+        self._loop = ControlLoop(*parts)
+        self.stop = self._loop.stop
         self._over = threading.Event()
         self._failures: List[BaseException] = []
 
-    def run(self, stop: _Stop, until: Optional[threading.Event]) -> bool:
-        """Drive until it is told to stop; returns False where a thread hangs.
-
-        Raises UserError where a vehicle cannot be enabled, and where it gave way.
-        """
-        stop.on_stop = self._loop.stop
+    def run(self, until: Optional[threading.Event]) -> bool:
+        """Drive until it is told to stop; returns False where a thread hangs. Raises UserError."""
         if until is not None:
-            threading.Thread(target=self._stop_when, args=(until,), daemon=True).start()
+            threading.Thread(target=lambda: until.wait() and self.stop(), daemon=True).start()
         # Apart from the watchdog, which is the main thread: a reader of stdout may be stalled.
         announcer = threading.Thread(target=self._announce, name="announce", daemon=True)
         # What is loaded stays: the collector need not look at it again in the middle of a drive.
@@ -186,24 +155,17 @@ class _Runtime:
             self._tls.require_valid(time.time())
         return ended
 
-    def _stop_when(self, until: threading.Event) -> None:
-        until.wait()
-        self._loop.stop()
-
     def _announce(self) -> None:
         """Show that it is there, print "ready", and log what keeps states away."""
         config, policy = self._config, self._policy
         try:
-            self._link.appear(self._open_client, self._loop.stop)
+            self._link.appear(self._open_client, self.stop)
             if policy.trust != VERIFIED:
                 log.event("warning", "policy_not_verified", trust=policy.trust)
             health = self._loop.health()
-            print(
-                f"ready vehicle_id={config.vehicle_id} vehicle={health.vehicle}"
-                f" connect={config.connect} policy_id={policy.policy_id}"
-                f" verified_by={printable(policy.public_key or 'none')}",
-                flush=True,
-            )
+            who = f"ready vehicle_id={config.vehicle_id} vehicle={health.vehicle}"
+            what = f"policy_id={policy.policy_id} verified_by={policy.public_key or 'none'}"
+            print(printable(f"{who} connect={config.connect} {what}"), flush=True)
             self._notifier.tell(f"READY=1\nSTATUS={health.mode}")
             while not self._over.wait(_WAITING_PERIOD_S) and not self._loop.has_heard():
                 answers, why = why_no_link(config.connect, self._tls)
@@ -211,7 +173,7 @@ class _Runtime:
                 log.event("warning", "waiting", why=f"{config.connect}: {state}")
         except BaseException as error:  # the main thread raises it
             self._failures.append(error)
-            self._loop.stop()
+            self.stop()
 
     def _close(self, announcer: threading.Thread) -> bool:
         """End the threads, brake and close the vehicle; returns False where one of them hangs."""
@@ -234,18 +196,17 @@ class _Runtime:
 
 
 def _controller(config: Config, policy: Policy, vehicle: Optional[Vehicle]) -> Controller:
-    period_s, its_limits = policy.manifest.control_period_s, {}
+    manifest, its_limits = policy.manifest, {}
     if vehicle is not None:
-        vehicle.control_period_s = period_s
-        its_limits = narrowed(vehicle.limits, vehicle.allowed, vehicle.model_limits)
-    return Controller(
-        ControllerConfig(
-            limits=shared_limits(policy.manifest.action, its_limits),
-            control_period_s=period_s,
-            needs_rearm=vehicle is not None,
-            armed_at_start=config.is_armed_at_start,
-            task=policy.layout.task_text,
-            ride_s=config.ride_through.max_s,
-            each_episode=config.rearm == EACH_EPISODE,
-        )
+        vehicle.control_period_s = manifest.control_period_s
+        its_limits = vehicle.allowed_limits
+    rules = ControllerConfig(
+        limits=shared_limits(manifest.action, its_limits),
+        control_period_s=manifest.control_period_s,
+        needs_rearm=vehicle is not None,
+        armed_at_start=config.is_armed_at_start,
+        task=policy.layout.task_text,
+        ride_s=config.ride_through.max_s,
+        each_episode=config.rearm == EACH_EPISODE,
     )
+    return Controller(rules)

@@ -81,15 +81,12 @@ FRESH_EVENTS = (Event.FRESH, Event.RECOVERED, Event.FINAL)
 class Safety(NamedTuple):
     """Where the machine stands. `reason` is the fault that stopped it, empty elsewhere.
 
-    `control_period_s` is T. It never changes.
-
     `last_fresh_s` and `session` are the monotonic arrival of the newest state that was not late,
     and the simulator that sent it, None before the first one. `permitted_s` is when it last drove
-    or was re-armed, or the arrival of the very first state. `ride_s` never changes; 0: no
-    ride-through.
+    or was re-armed, or the arrival of the very first state. T and `ride_s` (0: off) never change.
     """
 
-    control_period_s: float
+    control_period_s: float  # T
     mode: Mode = Mode.STANDBY
     reason: str = ""
     fresh_in_a_row: int = 0

@@ -1,11 +1,9 @@
 """`python -m edge_runtime sense`, or `bridge sense`: a robot's own senses in the simulator's place.
 
 A source is a class with `observe()`, which returns an array for each entry of the policy's
-manifest, taken after it was called. `Intake` judges what it says and makes states of it; it is
-pure: time is passed in. A thread of its own calls the source, so that one that hangs holds neither
-the loop nor ^C (unless it holds the interpreter). What is too old is not sent, and any other fault
-ends the command: no state comes, and the edge runtime stops by its own rule, as if the cable had
-been pulled. It runs on the board with the board's libraries alone.
+manifest, taken after it was called. What is too old is not sent, and any other fault ends the
+command: no state comes, and the edge runtime stops by its own rule, as if the cable had been
+pulled. It runs on the board with the board's libraries alone.
 """
 
 from __future__ import annotations
@@ -19,7 +17,7 @@ import sys
 import threading
 import time
 from importlib import import_module
-from typing import Any, Callable, Dict, List, Mapping, NamedTuple, Optional, Tuple
+from typing import Any, Callable, Dict, Iterator, List, Mapping, NamedTuple, Optional, Tuple
 
 import msgspec
 import numpy as np
@@ -37,9 +35,8 @@ from edge_runtime.util import UserError, printable
 from edge_runtime.wire import Command, Rejection, State
 
 SOURCE_FAILED = 1  # exit status
+# A camera's noise changes each picture: one that stays is frozen, or the lens is covered.
 FROZEN_PERIODS = 5
-"""A camera's noise changes a picture each time: one that stays the same for so long is frozen, or
-the lens is covered."""
 GIVES_UP_S = 2.0  # so long without a state, and the command ends: the vehicle stopped long ago
 ROUNDING_S = 1e-9
 _POLL_S = 0.1  # a signal that another thread got wakes nobody: so it polls
@@ -62,21 +59,13 @@ class Seen(NamedTuple):
 def look(source: Any, task: Task) -> Seen:
     """Ask a source once. Raises SourceError for what is not the task's, and whatever it raises."""
     observation = pack(task, source.observe())
-    speed_mps, over = (_offered(source, name) for name in ("speed_mps", "episode_over"))
+    offered = (getattr(source, name, None) for name in ("speed_mps", "episode_over"))
+    speed_mps, over = (each() if callable(each) else each for each in offered)
     return Seen(observation, None if speed_mps is None else float(speed_mps), bool(over))
 
 
-def _offered(source: Any, name: str) -> Any:
-    """Return what an optional attribute or method says; None where there is none."""
-    value = getattr(source, name, None)
-    return value() if callable(value) else value
-
-
 def pack(task: Task, seen: Any) -> Dict[str, bytes]:
-    """Return the arrays' bytes. Raises SourceError for other names, shapes or types than asked for.
-
-    A float may be of any size; no other number is converted.
-    """
+    """Return the arrays' bytes; a float may be of any size. Raises SourceError for any other."""
     if not isinstance(seen, Mapping) or seen.keys() != task.observation.keys():
         found = ", ".join(map(str, seen)) if isinstance(seen, Mapping) else type(seen).__name__
         raise SourceError(f"it observes {found}, not {', '.join(task.observation)}")
@@ -93,11 +82,11 @@ def pack(task: Task, seen: Any) -> Dict[str, bytes]:
 
 
 class Intake:
-    """Makes the states of one session from what a source says.
+    """Judges what a source says, and makes the states of one session of it; monotonic times.
 
-    Times are monotonic. A state is stamped with the moment at which the source was asked. The
-    answer may take 2.2 T, as long as the edge runtime answers a state, but more than T only once in
-    a row: the policy is made for T.
+    A state is stamped with the moment at which the source was asked. The answer may take 2.2 T, as
+    long as the edge runtime answers a state, but more than T only once in a row: the policy is made
+    for T.
     """
 
     def __init__(self, task: Task, session: str, zero_ns: int) -> None:
@@ -111,8 +100,7 @@ class Intake:
     def take(self, seen: Seen, asked_s: float, now_s: float) -> Optional[State]:
         """Return the state to send now; None where it is too old.
 
-        Raises SourceError for numbers that are not finite, and for a picture that has frozen; this
-        session is then over.
+        Raises SourceError for numbers that are not finite, and for a picture that has frozen.
         """
         self._watch(seen.observation)
         period_s, periods = self._task.control_period_s, 1.0 if self._was_slow else SILENCE_PERIODS
@@ -147,13 +135,15 @@ class Intake:
 
 
 class _Source:
-    """Calls a source in a thread of its own: at the start once, then once for each `ask`."""
+    """Calls a source in a thread of its own: at the start once, then once for each `ask`.
+
+    So one that hangs holds neither the loop nor ^C (unless it holds the interpreter).
+    """
 
     def __init__(self, make: Callable[[], Any], task: Task) -> None:
         self._asked: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._said: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        work = (make, task)
-        threading.Thread(target=self._run, args=work, name="source", daemon=True).start()
+        threading.Thread(target=self._run, args=(make, task), daemon=True).start()
 
     def ask(self) -> None:
         self._asked.put(None)
@@ -200,10 +190,8 @@ class _End:
 
     def send(self, state: State) -> None:
         """Publish a state, and for viewers how it is to be read."""
-        status: Any = self._scenes.matching_status
-        if status.matching:
-            place = {name: getattr(state, name) for name in ("episode", "step", "sim_time_s")}
-            self._scenes.put(msgspec.msgpack.encode({**place, "task": self._task}))
+        place = {name: getattr(state, name) for name in ("episode", "step", "sim_time_s")}
+        self._scenes.put(msgspec.msgpack.encode({**place, "task": self._task}))
         self._states.put(wire.encode(state))
 
     def close(self) -> None:
@@ -218,8 +206,7 @@ class _End:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    place = "the source: a class with observe() -> {entry: array}, and optionally speed_mps and "
-    place += "episode_over"
+    place = "the source: a class with observe() -> {entry: array}; may have speed_mps, episode_over"
     add("--source", metavar="MODULE:CLASS", required=True, help=place)
     says = "the policy that is to drive: it says what is observed, and how often"
     add("--policy", metavar="POLICY.onnx", type="path", required=True, help=says)
@@ -239,11 +226,7 @@ def run(arguments: argparse.Namespace) -> int:
     manifest = load_manifest(asked.policy, asked.public_key, asked.allow_unsigned)
     task = Task(**{name: getattr(manifest, name) for name in Task.__struct_fields__})
     make = _load(asked.source)
-    with sigterm_as_interrupt(), contextlib.ExitStack() as stack:
-        session = _open(asked, vehicle_id, tls)
-        stack.callback(session.close)
-        end = _End(session, vehicle_id, task)
-        stack.callback(end.close)
+    with sigterm_as_interrupt(), _open(asked, vehicle_id, task, tls) as end:
         try:
             source = _Source(make, task)
             source.answer()  # The first one is not sent: a camera takes its time to open.
@@ -251,9 +234,8 @@ def run(arguments: argparse.Namespace) -> int:
             _sense(source, end, task, tls)
         except SourceError as error:
             # At once, before anything is closed: nothing is sent any more.
-            stops = "nothing is sent any more, so the vehicle stops"
-            print(f"error: the source {asked.source} has failed: {error}; {stops}", file=sys.stderr)
-            sys.stderr.flush()
+            stops = f"{error}; nothing is sent any more, so the vehicle stops"
+            print(f"error: {asked.source} has failed: {stops}", file=sys.stderr, flush=True)
     return SOURCE_FAILED
 
 
@@ -288,21 +270,24 @@ def _load(place: str) -> Callable[[], Any]:
     """Import `module:Class`. Raises UserError."""
     module, _, member = place.partition(":")
     try:
-        made: Callable[[], Any] = getattr(import_module(module), member)
+        return getattr(import_module(module), member)
     except BaseException as error:  # a module may raise anything when it is imported
         raise UserError(f"no source {place!r}: {type(error).__name__}: {error}") from None
-    return made
 
 
+@contextlib.contextmanager
 def _open(
-    asked: argparse.Namespace, vehicle_id: str, tls: Optional[access.TlsFiles]
-) -> zenoh.Session:
-    """Open the session as a simulator's. Raises UserError."""
+    asked: argparse.Namespace, vehicle_id: str, task: Task, tls: Optional[access.TlsFiles]
+) -> Iterator[_End]:
+    """Connect, or listen, as a simulator does. Raises UserError."""
     rules = None
     if tls is not None:
         able = (access.ROUTER,) if asked.connect is None else ()
         access.check_name(tls.name, access.common_name(access.SIMULATOR, vehicle_id), *able)
         rules = access.rules_for_listener([vehicle_id])
     if asked.connect is not None:
-        return open_session(connect=asked.connect, mode="client", tls=tls)
-    return open_session(listen=asked.listen, mode="router", tls=tls, access=rules)
+        session = open_session(connect=asked.connect, mode="client", tls=tls)
+    else:
+        session = open_session(listen=asked.listen, mode="router", tls=tls, access=rules)
+    with session, contextlib.closing(_End(session, vehicle_id, task)) as end:
+        yield end

@@ -1,38 +1,31 @@
-"""The runtime as a service on a board: systemd (sd_notify(3), Type=notify), sensors, durations, and
-an installer's hold.
-"""
+"""The runtime as a service on a board: systemd (sd_notify(3), Type=notify), sensors, durations."""
 
 from __future__ import annotations
 
 import contextlib
-import fcntl
+import math
 import os
 import socket
 import threading
 from pathlib import Path
-from typing import BinaryIO, Collection, Dict, Mapping, NamedTuple, Optional
+from typing import Collection, Dict, Mapping, NamedTuple, Optional
 
 import numpy as np
 
 from edge_runtime import log
-from edge_runtime.util import open_regular
 
 WINDOW = 1024
 _LOOK_PERIOD_S = 2.0
 
 
 class Notifier:
-    """Sends READY, WATCHDOG, STATUS and STOPPING to systemd, where it runs under systemd.
-
-    Never waits: a message for which systemd has no room is dropped.
-    """
+    """Tells systemd, where it runs under systemd; a message without room there is dropped."""
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
-        self.watchdog_period_s: Optional[float] = None
-        """Half of the time that systemd waits; None where it does not watch this process."""
+        self.watchdog_period_s = math.inf
+        """Half of the time that systemd waits; inf where it does not watch this process."""
         if int(environment.get("WATCHDOG_PID", os.getpid())) == os.getpid():
-            timeout_us = int(environment.get("WATCHDOG_USEC", "0"))
-            self.watchdog_period_s = timeout_us / 2e6 or None
+            self.watchdog_period_s = int(environment.get("WATCHDOG_USEC", "0")) / 2e6 or math.inf
         address = environment.get("NOTIFY_SOCKET", "")
         # "@" stands for the NUL byte with which an abstract address begins.
         self._address = "\0" + address[1:] if address.startswith("@") else address
@@ -40,7 +33,6 @@ class Notifier:
         self._socket.setblocking(False)
 
     def tell(self, text: str) -> None:
-        """Send a state of sd_notify(3), like `READY=1`; never waits."""
         if self._address:
             try:
                 self._socket.sendto(text.encode(), self._address)
@@ -94,32 +86,3 @@ def quantiles_ms(durations_ns: Collection[int]) -> Dict[str, float]:
     """p50, p99 and max in milliseconds; zeros where there are no durations."""
     p50, p99, top = np.percentile(np.array([*durations_ns] or [0]) / 1e6, [50, 99, 100])
     return {"p50": float(p50), "p99": float(p99), "max": float(top)}
-
-
-class Hold:
-    """Keeps commands from wire and vehicle while an installer tries this release.
-
-    The installer holds a lock on the file `path` for as long as it judges. The lock ends with its
-    process, so an installer that dies silences no runtime. Once free, this process never asks
-    again. A file that is not there holds nothing.
-    """
-
-    def __init__(self, path: str) -> None:
-        self._stream: Optional[BinaryIO] = None
-        with contextlib.suppress(FileNotFoundError):
-            self._stream = open_regular(path)  # kept until it is free
-
-    def is_on(self) -> bool:
-        """Return whether commands must stay here. Never waits."""
-        if self._stream is not None:
-            try:
-                fcntl.flock(self._stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
-            except BlockingIOError:
-                return True
-            self._stream.close()
-            self._stream = None
-        return False
-
-    def refusal(self) -> str:
-        """Say why nobody may re-arm now; empty when free."""
-        return "an installer tries this release; re-arm when it is done" if self.is_on() else ""

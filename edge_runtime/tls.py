@@ -52,11 +52,7 @@ class TlsFiles(NamedTuple):
 
 
 def load_tls(directory: PathLike) -> TlsFiles:
-    """Check the three files against one another and the clock.
-
-    Raises UserError for a file that is missing or no PEM, a key that others can read or that is
-    another certificate's, a certificate of another authority, expired, or not valid yet.
-    """
+    """Check the three files against one another and the clock; UserError where one is wrong."""
     # Here: without TLS nothing pays for it, in memory and at the start.
     from cryptography import x509
     from cryptography.exceptions import InvalidSignature
@@ -174,20 +170,14 @@ def common_name(role: str, vehicle_id: Optional[str] = None) -> str:
 
 
 def check_name(name: str, *able: str) -> None:
-    """Raise UserError where a certificate's name is not one of those that may do this.
-
-    Zenoh would not say so: the messages would go nowhere.
-    """
+    """Raise UserError where a certificate's name may not do this: Zenoh would say nothing."""
     if name not in able:
         right = f"name the directory of {' or '.join(able)}"
         raise UserError(f"--tls names the certificate of {name}; {right}")
 
 
 def rules_for_listener(vehicle_ids: Sequence[str]) -> Dict[str, Any]:
-    """Make Zenoh's `access_control` for a listener: the rights of every party of these vehicles.
-
-    All else is denied: other names, other keys, and `delete` for everybody.
-    """
+    """Make a listener's `access_control`: the rights of each party of these vehicles, no more."""
     parties = {
         common_name(role, vehicle_id): _rules(rights, vehicle_id)
         for role, rights in ROLES.items()
@@ -197,11 +187,7 @@ def rules_for_listener(vehicle_ids: Sequence[str]) -> Dict[str, Any]:
 
 
 def rules_for_edge(vehicle_id: str) -> Dict[str, Any]:
-    """Make Zenoh's `access_control` for an edge runtime: what its listener may hand it.
-
-    Without it, the simulator of another vehicle could pose as the one that this edge looks for:
-    its certificate is a server's, too, and of the same authority.
-    """
+    """Make an edge runtime's `access_control`: no other vehicle's simulator may pose as its own."""
     # The edge's own rules, as it applies them itself: what it may send leaves here.
     rules = _rules(ROLES[EDGE], vehicle_id, from_it="egress", to_it="ingress")
     return _access_control({common_name(SIMULATOR, vehicle_id): rules, ROUTER: rules})

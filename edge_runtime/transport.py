@@ -15,7 +15,7 @@ from typing import Any, Callable, Dict, List, Optional, Sequence, Union
 
 import zenoh
 
-from edge_runtime.reach import check_port_is_free, why_no_link
+from edge_runtime.reach import why_no_link
 from edge_runtime.tls import EDGE, OPERATOR, TlsFiles, common_name, load_tls
 from edge_runtime.util import PathLike, UserError
 
@@ -67,26 +67,26 @@ def open_session(
 ) -> zenoh.Session:
     """Open a session that listens, connects, or both. Close it before the process ends.
 
-    `mode` is "router", "peer" or "client". `access` is Zenoh's `access_control`, of tls.py; a
-    session that listens with TLS must have it. Raises UserError for a malformed endpoint, one that
-    does not go with `tls`, a busy port, and, in client mode, nobody there who gives a link.
+    `mode` is "router", "peer" or "client"; `access` is Zenoh's `access_control`, of tls.py. Raises
+    UserError for a malformed endpoint, one that does not go with `tls`, a busy port, and, in client
+    mode, nobody there who gives a link.
     """
     listens = [listen] if isinstance(listen, str) else list(listen or [])
     if listens and tls is not None and access is None:
         raise ValueError("a TLS listener needs access control: any certificate could say all")
     for endpoint in [*listens, *([] if connect is None else [connect])]:
         check_fits(check_endpoint(endpoint), tls is not None)
-    for endpoint in listens:
-        check_port_is_free(endpoint)
     config = zenoh.Config()
-    for name, value in session_rows(listens, connect, mode, tls, access).items():
+    for name, value in _settings(listens, connect, mode, tls, access).items():
         config.insert_json5(name, json.dumps(value))
     link = f"link to {connect}" if tls is None else f"TLS link to {connect} as {tls.name}"
     try:
         session = zenoh.open(config)
     except zenoh.ZError as error:
         if connect is None or listens:
-            raise UserError(f"Zenoh cannot open {', '.join(listens) or connect}: {error}") from None
+            why = str(error).partition(" at /")[0]  # where in Zenoh's source it was raised
+            words = f"cannot listen at {', '.join(listens)}: {why}; choose another with --listen"
+            raise UserError(words) from None
         why = why_no_link(connect, tls)[1]
         first = "start the simulator or router there first, or name another address with --connect"
         raise UserError(f"no {link}{why and f' ({why})'}; {first}") from None
@@ -99,7 +99,7 @@ def open_session(
     return session
 
 
-def session_rows(
+def _settings(
     listens: List[str], connect: Optional[str], mode: str, tls: Optional[TlsFiles], access: Any
 ) -> Dict[str, Any]:
     """Return Zenoh's settings by their paths, as in `scouting/gossip/enabled`."""
@@ -130,10 +130,7 @@ def session_rows(
 
 
 def only_own(key: str, hear: Callable[[zenoh.Sample], None]) -> Callable[[zenoh.Sample], None]:
-    """Make a subscriber's callback that drops what was not put to this very key.
-
-    Zenoh delivers whatever intersects: a put to `phil/*/state` comes to every vehicle.
-    """
+    """Make a callback that drops what was put to `phil/*/state` and the like, not to this key."""
 
     def take(sample: zenoh.Sample) -> None:
         if str(sample.key_expr) == key:

@@ -27,11 +27,7 @@ class UserError(Exception):
 
 
 def name_in_file(name: str, said: str, option: str) -> str:
-    """Return a name that a file holds, of something to load: built in, or an entry point.
-
-    `said` are the words before it, as in "F was trained in". Raises UserError for `module:thing`:
-    no file decides what is imported, so a person must type that after `option`.
-    """
+    """Return what a file names to load. UserError for `module:thing`: a person must type that."""
     if ":" in name:
         rule = f"a module is imported only when it is typed: give {option} {shlex.quote(name)}"
         raise UserError(f"{said} {name}: {rule}")
@@ -56,10 +52,7 @@ def open_regular(path: PathLike) -> BinaryIO:
 
 
 def read_bytes(path: PathLike, what: str, most_mib: int = MAX_FILE_MIB) -> bytes:
-    """Read a regular file of at most `most_mib`; UserError where that fails.
-
-    `what` names the file in the error, as in "policy file".
-    """
+    """Read a regular file, called `what` in the UserError, of at most `most_mib`."""
     try:
         with open_regular(path) as stream:
             data = stream.read((most_mib << 20) + 1)

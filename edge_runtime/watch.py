@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import sys
 import time
-from typing import Any, Callable, Dict, List, Mapping, Optional, Sequence
+from typing import Any, Callable, List, Mapping, Optional, Sequence
 
-from edge_runtime.link import FIELDS
+from edge_runtime.link import link_rows
 from edge_runtime.util import UserError, printable
 
 _PERIOD_S = 1.0
@@ -45,7 +45,7 @@ def render(status: Status) -> List[str]:
         "leash": f"{_number(status.get('leash_left_m'), 'm')} of {_number(status.get('leash_m'))}",
         "battery": _number(told.get("battery_v"), "V"),
         "board": _number(status.get("temperature_c"), "C"),
-        **_link(status.get("link", {})),
+        **link_rows(status.get("link", {})),
     }
     age_s = (status["sent_ns"] - told.get("sent_ns", status["sent_ns"])) * 1e-9
     if age_s > _OLD_S:
@@ -54,20 +54,9 @@ def render(status: Status) -> List[str]:
 
 
 def _who(status: Status) -> str:
-    """Say who may move the vehicle now."""
     if status["vehicle"] == "none":
         return "nobody: no vehicle"
     return "NOBODY until a re-arm" if status["needs_rearm"] else "THE POLICY"
-
-
-def _link(link: Mapping[str, float]) -> Dict[str, str]:
-    if not link.keys() >= set(FIELDS):
-        return {"link": "not known yet"}
-    return {
-        f"link {way}": f"{link[f'{way}_ms']:.0f} ms +-{link[f'{way}_jitter_ms']:.0f},"
-        f" {link[f'{way}_lost_percent']:.1f} % lost"
-        for way in ("up", "down")
-    }
 
 
 def _actions(names: Sequence[str], action: Optional[Sequence[float]]) -> str:

@@ -24,7 +24,6 @@ class RacetrackExpert:
         self.env = env
 
     def act(self) -> np.ndarray:
-        """Return the steering, in [-1, 1]."""
         car, lane = self.env.vehicle, self._lane()
         along_m, aside_m = lane.local_coordinates(car.position)
         speed_mps = max(car.speed, 1.0)

@@ -43,14 +43,12 @@ class Racetrack(gymnasium.Wrapper[Any, Any, Any, Any]):
         super().__init__(gymnasium.make("racetrack-v0", **options))
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        """Begin an episode."""
         begun = self.env.reset(seed=seed, options=options)
         car: Any = self.env.unwrapped  # Its observation is made anew in each episode.
         car.observation_type.fill_road_layer_by_lanes = partial(mark_road, car.observation_type)
         return begun
 
     def step(self, action: Any) -> Any:
-        """Drive for one control period and report success."""
         *seen, info = self.env.step(action)
         car: Any = self.env.unwrapped
         well = not car.vehicle.crashed and car.vehicle.on_road
@@ -58,16 +56,12 @@ class Racetrack(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 class Hill(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Gymnasium's MountainCarContinuous-v0; the goal is the top of the hill.
-
-    The car is too weak to drive up: it must roll to and fro. Rewards are a tenth of its own.
-    """
+    """MountainCarContinuous-v0, a tenth of its rewards: the goal is the hill's top, by swinging."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(gymnasium.make("MountainCarContinuous-v0", **options))
 
     def step(self, action: Any) -> Any:
-        """Drive for one control period and report success."""
         seen, reward, terminated, *rest, info = self.env.step(action)
         return seen, 0.1 * float(reward), terminated, *rest, {**info, "is_success": terminated}
 
@@ -81,15 +75,12 @@ class HillExpert:
         self.env, self.against = env, 0
 
     def reset(self) -> None:
-        """Forget the last episode."""
         self.against = 0
 
     def act(self) -> np.ndarray:
-        """Return the push, in [-1, 1]."""
         return np.array([1.0 if self.env.state[1] >= 0.0 else -1.0])
 
     def wants_control(self, policy_action: np.ndarray) -> str | None:
-        """Return why it takes over, or None."""
         wasted = float(policy_action[0]) * float(self.act()[0]) < 0.3
         self.against = self.against + 1 if wasted else 0
         return "wasted" if self.against > self.PATIENCE else None
@@ -104,13 +95,11 @@ class Lander(gymnasium.Wrapper[Any, Any, Any, Any]):
         super().__init__(gymnasium.make("LunarLanderContinuous-v3", **options))
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        """Begin an episode."""
         seen, info = self.env.reset(seed=seed, options=options)
         self.unwrapped.seen = seen
         return seen, info
 
     def step(self, action: Any) -> Any:
-        """Drive for one control period and report success."""
         seen, reward, terminated, truncated, info = self.env.step(action)
         self.unwrapped.seen = seen
         landed = terminated and reward == self.LANDED
@@ -126,13 +115,11 @@ class LanderExpert:
         self.env = env
 
     def act(self) -> np.ndarray:
-        """Return the main engine's and the side engines' throttle, each in [-1, 1]."""
         from gymnasium.envs.box2d.lunar_lander import heuristic
 
         return np.clip(heuristic(self.env, self.env.seen), -1.0, 1.0)
 
     def wants_control(self, policy_action: np.ndarray) -> str | None:
-        """Return why it takes over, or None."""
         return "off" if np.abs(policy_action - self.act()).max() > self.STRICT else None
 
 

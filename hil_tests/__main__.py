@@ -16,14 +16,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "hil_tests.commands:campaign",
         "inject every fault, test every simulated network, and write a report",
     ),
-    "envelope": (
-        "hil_tests.commands:envelope",
-        "find the delay, jitter and loss that a policy can bear",
-    ),
-    "mock_hunter": (
-        "hil_tests.mock_hunter",
-        "run a simulated Hunter on a CAN bus, with its faults",
-    ),
+    "envelope": ("hil_tests.commands:envelope", "find the networks that a policy can bear"),
+    "mock_hunter": ("hil_tests.mock_hunter", "run a mock Hunter on a CAN bus, with its faults"),
     "conformance": ("hil_tests.conformance", "test a vehicle's driver against the safety rules"),
 }
 

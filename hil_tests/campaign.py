@@ -34,8 +34,6 @@ TARGET = 0.98  # Share of successes that a network within the budget leaves
 
 
 class Axis(NamedTuple):
-    """What gets worse, step by step."""
-
     name: str
     title: str
     unit: str
@@ -45,7 +43,6 @@ class Axis(NamedTuple):
 
     @property
     def specs(self) -> list[str]:
-        """Return the specifications of all values."""
         return [self.pattern.format(f"{value:g}") if value else self.base for value in self.values]
 
 
@@ -116,7 +113,6 @@ def choose(names: str | None, only: str | None) -> tuple[list[Axis], list[Row]]:
 
 
 def missed_in(row: Found) -> list[str]:
-    """Return what was not as expected in a fault's row of a report."""
     late = ["late"] * (row["reaction_late"] + row["recovery_late"])
     return [*late, *row["wrong"], *row["unsafe"], *row["crashes"]]
 
@@ -145,7 +141,6 @@ def render_faults(report: Found) -> list[str]:
 def run_latency(
     arguments: argparse.Namespace, policy: Path, axes: Sequence[Axis]
 ) -> dict[str, Any]:
-    """Drive every network of the axes; return the report's part ``latency``."""
     specs = list(dict.fromkeys(spec for axis in axes for spec in axis.specs))
     seeds = range(arguments.seed, arguments.seed + arguments.runs)
     asked = {name: getattr(arguments, name) for name in ("scenario", "condition", "seed", "runs")}
@@ -188,7 +183,6 @@ def budget(axes: Sequence[Axis], rows: Found, name: str) -> dict[str, Any]:
 
 
 def render_latency(latency: Found) -> list[str]:
-    """Render the budget's sentence and a table for each axis, as lines of Markdown."""
     lines = [latency["budget"]["sentence"], ""]
     for axis in latency["axes"]:
         rows = []

@@ -75,8 +75,6 @@ def _add_common(parser: argparse.ArgumentParser, env: str) -> None:
     policy = f"policy file (default: results/policies/{env}.onnx)"
     add("--policy", metavar="P.onnx", type="path", help=policy)
     add_public_key(parser)
-    add(
-        "--condition", choices=CONDITIONS, default=NOMINAL, help="traffic and noise of the scenario"
-    )
+    add("--condition", choices=CONDITIONS, default=NOMINAL, help="the scenario's traffic and noise")
     add("--seed", type=count, default=0, help="seed of the first drive")
     add("--jobs", type=count, default=0, help="parallel drives or faults; 0: one per core")

@@ -124,7 +124,6 @@ class Bench:
             time.sleep(self.pause_s)
 
     def goes(self, limit_s: float = PATIENCE_S) -> bool:
-        """Return whether commands move it."""
         return self.until(moves=True, limit_s=limit_s, commands=True)
 
     def starts(self) -> bool:
@@ -152,12 +151,10 @@ class Bench:
         return after_mps < before_mps and self.until(moves=False)
 
     def stands_for_now(self) -> bool:
-        """Return whether it stands after a stop that is not latched."""
         self.call("brake", latch=False)
         return self.until(moves=False)
 
     def refuses(self, *actions: dict[str, float]) -> bool:
-        """Return whether each of these is a ValueError."""
         for action in actions:
             with contextlib.suppress(ValueError):
                 self.call("command", action)
@@ -175,7 +172,6 @@ class Bench:
         return True
 
     def closes(self) -> bool:
-        """Return whether it may be closed twice, and nothing moves it then."""
         self.stands_for_now()
         self.call("close")
         self.call("close")

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import argparse
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 from bridge.report import markdown_table
 from edge_runtime.cli import ArgumentParser, examples
 from edge_runtime.files import make_directory
+from edge_runtime.reach import free_endpoint
 from edge_runtime.util import read_json
-from hil_tests.processes import drive_shown, run_command
+from hil_tests.processes import Process, operator, run_command
 
-LATENCY = "50ms+-10ms"
+VEHICLE_ID, LATENCY = "demo01", "50ms+-10ms"
 GOOD_SUCCESS = 0.8  # What the drives without latency should reach
 RUNS, RECORDED_RUNS = 20, 2
 HUMAN = ("--episodes", 40, "--max-minutes", 2.5, "--refining-updates", 1000)
@@ -78,10 +80,19 @@ def drive(folder: Path, trust: tuple[str, ...]) -> dict[str, dict[str, Any]]:
     Return the reports of the first three, under their names.
     """
 
-    def simulate(name: str, runs: int, clock: str, latency: str, *listener: str) -> dict[str, Any]:
-        words = ("--episodes", str(runs), "--clock", clock, "--latency", latency, "--seed", "0")
-        out = folder / f"{name}.json"
-        drive_shown("demo01", trust, (*words, "--out", str(out)), listener)
+    def simulate(name: str, runs: int, clock: str, latency: str, *view: object) -> dict[str, Any]:
+        out, endpoint, us = folder / f"{name}.json", free_endpoint(), ("--vehicle-id", VEHICLE_ID)
+        words = ("--episodes", runs, "--clock", clock, "--latency", latency, "--out", out)
+        with ExitStack() as stack:
+            edge = ("edge_runtime", "run", *trust, "--vehicle", "mock", "--connect", endpoint, *us)
+            stack.enter_context(Process(*edge, ready="ready", shown=True))
+            viewer = ("bridge", *view, "--connect", endpoint, *us)
+            views = [stack.enter_context(Process(*viewer, shown=True))] if view else []
+            stack.enter_context(operator(endpoint, VEHICLE_ID))
+            where = ("--listen", endpoint, *us)
+            run_command("bridge", "simulate", "--env", "left_turn", *where, *words)
+            for each in views:
+                each.succeed()
         return read_json(out, "report")
 
     reports = {}
@@ -94,8 +105,7 @@ def drive(folder: Path, trust: tuple[str, ...]) -> dict[str, dict[str, Any]]:
     print(f"\n6  Again, with {LATENCY} of latency each way")
     reports["... 50 ± 10 ms each way"] = simulate("wire_latency", RUNS, "lockstep", LATENCY)
     print("\n7  In real time, recorded for rerun")
-    view = ("view", "--save", str(folder / "drive.rrd"))
-    simulate("realtime", RECORDED_RUNS, "realtime", LATENCY, *view)
+    simulate("realtime", RECORDED_RUNS, "realtime", LATENCY, "view", "--save", folder / "drive.rrd")
     return reports
 
 

@@ -60,8 +60,6 @@ AXES = {
 
 
 class Tried(TypedDict):
-    """What was found of a network."""
-
     verdict: str
     drives: int
     successes: int
@@ -293,7 +291,6 @@ _mine: list[Any] = []  # Of a process of the pool: environment, driver, conditio
 
 
 def _load(policy: str, env: str, condition: str, key: str | None, period_s: float | None) -> Any:
-    """Return the environment, the policy as its driver, and the policy's id."""
     environment = make_environment(env, condition, period_s=period_s)
     return environment, *load_driver(policy, environment, key)
 

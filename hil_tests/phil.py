@@ -17,12 +17,9 @@ FOLDERS = {
 
 
 def main() -> None:
-    sys.exit(run_cli(_run))
-
-
-def _run(argv: list[str]) -> int:
-    if argv and argv[0] in FOLDERS:
-        os.execv(sys.executable, [sys.executable, "-m", *argv])
+    if sys.argv[1:] and sys.argv[1] in FOLDERS:
+        os.execv(sys.executable, [sys.executable, "-m", *sys.argv[1:]])
     commands = {name: (f"{name}.__main__", summary) for name, summary in FOLDERS.items()}
     what = "Human-guided driving policies, from training to the board."
-    return program("phil", what, commands, "phil hil_tests demo", "phil trainer train --help")(argv)
+    shown = ("phil hil_tests demo", "phil trainer train --help")
+    sys.exit(run_cli(program("phil", what, commands, *shown)))

@@ -11,12 +11,11 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Self
 
 from edge_runtime.link import ask
-from edge_runtime.reach import free_endpoint
 from edge_runtime.util import UserError
 from trainer.util import kept
 
@@ -35,8 +34,7 @@ class CommandTimeoutError(UserError, TimeoutError):
 
 
 class Process:
-    """``python -m ARGUMENTS`` beside us. It ends with the ``with`` block, and
-    with the thread that started it.
+    """``python -m ARGUMENTS`` beside us. It ends with the block, and the thread that started it.
 
     ``lines`` are its output of both streams with their monotonic times; ``output`` and ``errors``
     are the text of each stream. With ``ready``, a text, the constructor waits until that is
@@ -99,7 +97,6 @@ class Process:
         return float(wait_until(lambda: self._when(text), what, timeout_s))
 
     def tell(self, line: str) -> None:
-        """Write a line to its standard input."""
         assert self._process.stdin is not None
         self._process.stdin.write(line + "\n")
         self._process.stdin.flush()
@@ -108,7 +105,6 @@ class Process:
         self._process.send_signal(number)
 
     def kill(self) -> None:
-        """End it at once, and wait until it is gone."""
         self._process.kill()
         self.wait()
 
@@ -144,11 +140,6 @@ class Process:
         """Return whether it ended while nobody waited for that, or printed what a crash prints."""
         gone = self.has_ended and not self._ended_by_us
         return gone or any(mark in line for _, line in self.lines for mark in _CRASH_MARKS)
-
-    def resident_mb(self) -> float:
-        """Return its resident memory, MB (10^6 bytes)."""
-        pages = Path(f"/proc/{self.pid}/statm").read_text().split()[1]
-        return int(pages) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
     def __enter__(self) -> Self:
         return self
@@ -201,28 +192,6 @@ def run_command(*arguments: object) -> None:
         status = process.wait()
     if status:
         raise UserError(f"{' '.join(words[:4])} ended with status {status}")
-
-
-def drive_shown(
-    vehicle_id: str, trust: Sequence[str], simulate: Sequence[str], listener: Sequence[str] = ()
-) -> None:
-    """Drive the left turn with a mock vehicle and an operator, by commands as a person types them.
-
-    ``trust`` are the edge runtime's options for its policy, ``simulate`` further ones of ``bridge
-    simulate``; ``listener`` is a command of the bridge that ends after the drive. UserError.
-    """
-    endpoint = free_endpoint()
-    common = ("--connect", endpoint, "--vehicle-id", vehicle_id)
-    with contextlib.ExitStack() as stack:
-        edge = ("edge_runtime", "run", *trust, *common, "--vehicle", "mock")
-        stack.enter_context(Process(*edge, ready="ready", shown=True))
-        beside = Process("bridge", *listener, *common, shown=True) if listener else None
-        stack.enter_context(beside or contextlib.nullcontext())
-        stack.enter_context(operator(endpoint, vehicle_id))
-        where = ("--listen", endpoint, "--vehicle-id", vehicle_id)
-        run_command("bridge", "simulate", "--env", "left_turn", *simulate, *where)
-        if beside is not None:
-            beside.succeed()
 
 
 def wait_until(

@@ -17,7 +17,6 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
@@ -41,9 +40,7 @@ RETURNING: Colour = (185, 140, 255)
 """The person has let go, and the action is on its way back to the policy's."""
 SHADOW: Colour = (20, 160, 150)  # A policy beside the one that drives
 APPLIED: Colour = (235, 140, 40)  # What the car was told, whoever decided it
-BY_NAME = MappingProxyType(
-    {"policy": POLICY, "human": HUMAN, "returning": RETURNING, "applied": APPLIED}
-)
+BY_NAME = {"policy": POLICY, "human": HUMAN, "returning": RETURNING, "applied": APPLIED}
 GROUND, ROAD, MARKING = (222, 229, 216), (92, 97, 105), (235, 235, 235)
 PATH, GOAL, GLASS = (120, 190, 255), (84, 200, 120), (30, 34, 40)
 """Of the road from above, as people see it; the other cars have APPLIED's colour."""
@@ -191,7 +188,6 @@ class Viewer:
             raise
 
     def end(self) -> None:
-        """End it, even where it hangs."""
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()

@@ -62,13 +62,11 @@ class Canvas:
             self.log(path, look, static=True)
 
     def stand_at(self, step: int, **seconds: float) -> None:
-        """Set the time of all that is drawn next: the step, and seconds by timeline."""
         self.recording.set_time("step", sequence=step)
         for timeline, time_s in seconds.items():
             self.recording.set_time(timeline, duration=time_s)
 
     def scalar(self, path: str, *values: float) -> None:
-        """Draw the newest value of a line, or of each of several lines at one path."""
         self.log(path, rr.Scalars(values))
 
     def style(self, path: str, colour: Colour, names: Sequence[str]) -> None:
@@ -77,7 +75,6 @@ class Canvas:
         self.log(path, rr.SeriesLines(colors=colours, names=names, widths=widths), static=True)
 
     def state(self, path: str, value: str) -> None:
-        """Draw a state where it changes."""
         if self._states[path] != value:
             self._states[path] = value
             self.log(path, rr.StateChange(state=value))
@@ -131,7 +128,6 @@ class Canvas:
 
 
 def bounds_of(path: Sequence[Point]) -> list[tuple[float, float]]:
-    """Return the x and y ranges (m) that show the path."""
     return [(min(at) - MARGIN_M, max(at) + MARGIN_M) for at in zip(*path, strict=True)]
 
 
@@ -178,7 +174,6 @@ def sees_view(frames: bool = True) -> rrb.Horizontal:
 def two_columns(
     left: rrb.Container, right: rrb.Container, column_shares: list[int], timeline: str
 ) -> rrb.Blueprint:
-    """Lay out two columns and nothing else open, along ``timeline``."""
     return rrb.Blueprint(
         rrb.Horizontal(left, right, column_shares=column_shares),
         rrb.BlueprintPanel(state="collapsed"),
@@ -204,7 +199,6 @@ STATES = {"mode/mode": MODES, "mode/reason": {NO_REASON: GREY}, "mode/shadow": S
 
 
 def lay_out(scene: SeenScene | None, pictures: bool = True) -> rrb.Blueprint:
-    """Lay out the views; ``pictures``: whether the policy sees any."""
     left = rrb.Vertical(road_view(scene), sees_view(pictures), row_shares=[3, 1.4])
     mode = lanes_view("mode", "Mode, and why it does not drive")
     plots = [plot_view(*plot) for plot in PLOTS]
@@ -323,7 +317,6 @@ class WireLog:
         self._canvas.stand_at(step, sim_time=step * self._period_s)
 
     def _tell(self, mode: str, reason: str) -> None:
-        """Draw the mode where it changes."""
         if (mode, reason) == (self._mode, self._reason):
             return
         self._mode, self._reason = mode, reason

@@ -5,8 +5,8 @@ from functools import partial
 import pytest
 
 from bridge.tests.recordings import record_drive
-from hil_tests.testing import commands
-from hil_tests.testing.drives import SLOW_TOY, make_policy, read
+from hil_tests.tests.shared import commands
+from hil_tests.tests.shared.drives import SLOW_TOY, make_policy, read
 
 
 @pytest.fixture

@@ -23,9 +23,9 @@ from edge_runtime.policy import load_policy
 from edge_runtime.reach import free_endpoint
 from edge_runtime.wire import Health, encode
 from hil_tests.processes import Process, wait_until
-from hil_tests.testing.commands import exit_status
-from hil_tests.testing.drives import start_edge, start_simulate
-from hil_tests.testing.messages import HEALTH, make_command, make_state
+from hil_tests.tests.shared.commands import exit_status
+from hil_tests.tests.shared.drives import start_edge, start_simulate
+from hil_tests.tests.shared.messages import HEALTH, make_command, make_state
 
 EPOCH_NS = 1_700_000_000 * 10**9
 ANSWER_S, INFERENCE_S = 0.002, 0.001

@@ -19,9 +19,9 @@ from edge_runtime.reach import free_endpoint
 from edge_runtime.util import UserError
 from edge_runtime.wire import encode
 from hil_tests.processes import PATIENCE_S, wait_until
-from hil_tests.testing.drives import SLOW_TOY, make_policy, read, start_edge, start_simulate
-from hil_tests.testing.messages import make_command, make_feedback, make_state
-from hil_tests.testing.policies import TASK, T
+from hil_tests.tests.shared.drives import SLOW_TOY, make_policy, read, start_edge, start_simulate
+from hil_tests.tests.shared.messages import make_command, make_feedback, make_state
+from hil_tests.tests.shared.policies import TASK, T
 
 
 def test_what_an_action_raises_reaches_the_caller():

@@ -7,7 +7,7 @@ import pytest
 from bridge.ports import open_port
 from edge_runtime.reach import free_endpoint
 from hil_tests.processes import POLICY, PUBLIC_KEY
-from hil_tests.testing.drives import LEFT_TURN, TOY
+from hil_tests.tests.shared.drives import LEFT_TURN, TOY
 
 OURS = f"{POLICY.absolute()} --public-key {PUBLIC_KEY.absolute()}"
 ROWS = [

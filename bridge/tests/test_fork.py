@@ -13,7 +13,7 @@ import pytest
 
 from bridge.recording import Recording, choose_vehicle, heard_of, whole_recording
 from bridge.tests.recordings import bridge_status, flip_chunk, record_in_process
-from hil_tests.testing.drives import LEFT_TURN, TOY, make_policy, read
+from hil_tests.tests.shared.drives import LEFT_TURN, TOY, make_policy, read
 
 SHIPPED = Path(__file__).parents[2] / "results" / "policies"
 OURS = SHIPPED / "left_turn.onnx"

@@ -19,9 +19,9 @@ from bridge.simulate import vehicle_action
 from bridge.tests.recordings import health
 from edge_runtime.manifest import Action
 from edge_runtime.wire import encode
-from hil_tests.testing.environments import ToyEnv
-from hil_tests.testing.messages import make_command, make_feedback
-from hil_tests.testing.policies import TASK, T
+from hil_tests.tests.shared.environments import ToyEnv
+from hil_tests.tests.shared.messages import make_command, make_feedback
+from hil_tests.tests.shared.policies import TASK, T
 
 
 def checking(task=TASK):

@@ -22,10 +22,10 @@ from edge_runtime.manifest import Action, Entry, Task
 from edge_runtime.reach import free_endpoint
 from edge_runtime.wire import encode
 from hil_tests.processes import Process
-from hil_tests.testing import drives
-from hil_tests.testing.drives import start_edge
-from hil_tests.testing.messages import make_command, make_state
-from hil_tests.testing.policies import TASK
+from hil_tests.tests.shared import drives
+from hil_tests.tests.shared.drives import start_edge
+from hil_tests.tests.shared.messages import make_command, make_state
+from hil_tests.tests.shared.policies import TASK
 
 SEEN = {
     "a": Entry(dtype="uint8", shape=[6, 8, 3]),

@@ -94,7 +94,7 @@ def test_a_bad_specification_is_one_line_that_names_it(text):
 def test_a_wrong_value_is_answered_with_an_example_that_is_right(name):
     with pytest.raises(UserError, match=rf"write it like {name}="):
         parse_spec(f"{name}=wrong")
-    example = SETTINGS[name].example
+    example = SETTINGS[name].metadata["example"]
     assert parse_spec(f"{name}={example}") != LatencySpec()
 
 

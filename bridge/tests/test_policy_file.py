@@ -9,7 +9,7 @@ from onnx import helper, numpy_helper
 from deploy.__main__ import main
 from deploy.certs import write_key_pair
 from edge_runtime.policy import VERIFIED, load_policy
-from hil_tests.testing.commands import exit_status
+from hil_tests.tests.shared.commands import exit_status
 
 PENDULUM = "(float[b, 3] obs) => (float[b, 1] out)"
 TORQUE = "cos = Slice(obs, zero, one, one) out = Mul(cos, two)"

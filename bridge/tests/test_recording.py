@@ -60,7 +60,7 @@ from edge_runtime.wire import (
     encode,
 )
 from hil_tests.processes import wait_until
-from hil_tests.testing.drives import (
+from hil_tests.tests.shared.drives import (
     LEFT_TURN,
     SLOW_TOY,
     make_policy,
@@ -68,8 +68,8 @@ from hil_tests.testing.drives import (
     start_edge,
     start_simulate,
 )
-from hil_tests.testing.messages import make_command, make_state
-from hil_tests.testing.policies import SIZE, TASK
+from hil_tests.tests.shared.messages import make_command, make_state
+from hil_tests.tests.shared.policies import SIZE, TASK
 
 ODD = Task(task="", observation={"a": Entry(dtype="odd", shape=[1])}, action=[], control_period_s=1)
 ROOT = Path(__file__).parents[2]
@@ -242,7 +242,7 @@ def test_a_torn_file_is_read_up_to_the_tear(drive, tmp_path, keep):
     assert part == whole[: len(part)]
     read_again = Recording(torn)
     collections.deque(read_again.messages(), maxlen=0)
-    assert read_again.trouble() == "was cut off"
+    assert (read_again.cut_off, read_again.damaged_places) == (True, 0)
 
 
 def test_a_kill_loses_little_and_a_full_disk_nothing_that_was_written(tmp_path):
@@ -349,7 +349,7 @@ def test_only_the_damaged_chunk_is_lost(tmp_path, number):
     assert told_in(copy) == whole[:first] + whole[first + sizes[number] :]
     recording = Recording(copy)
     assert list(recording.messages())
-    assert recording.trouble() == "has 1 damaged place"
+    assert (recording.cut_off, recording.damaged_places) == (False, 1)
 
 
 def test_what_is_no_recording_is_refused_and_nobody_waits_for_a_pipe(tmp_path, refusal):
@@ -376,7 +376,7 @@ def test_no_change_of_bytes_makes_a_message_or_loses_one_unsaid(tmp_path):
             recording = Recording(path)
             found = [(channel.topic, m.log_time, m.data) for channel, m in recording.messages()]
             assert set(found) <= set(whole), at
-            assert found == whole or recording.trouble(), at
+            assert found == whole or recording.cut_off or recording.damaged_places, at
 
 
 def crafted(path, *chunks: tuple[bytes, int]):

@@ -8,8 +8,8 @@ from PIL import Image
 
 from bridge import replay as replay_module
 from bridge.tests.recordings import ANSWER_S, SILENCE, Hand, bridge_status, flip_chunk, ns
-from hil_tests.testing.drives import make_policy
-from hil_tests.testing.messages import WHITE, frames, make_state
+from hil_tests.tests.shared.drives import make_policy
+from hil_tests.tests.shared.messages import WHITE, frames, make_state
 
 FAULT = {"mode": "safe_stop", "reason": "vehicle_fault", "action": [-1.0]}
 NOT_ARMED = {"mode": "safe_stop", "reason": "not_armed", "action": [-1.0]}

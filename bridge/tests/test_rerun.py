@@ -40,10 +40,10 @@ from edge_runtime.reach import free_endpoint
 from edge_runtime.util import UserError
 from edge_runtime.wire import Rejection
 from hil_tests.processes import Process, wait_until
-from hil_tests.testing import drives
-from hil_tests.testing.environments import ToyEnv
-from hil_tests.testing.messages import HEALTH, make_command, make_state
-from hil_tests.testing.policies import TASK
+from hil_tests.tests.shared import drives
+from hil_tests.tests.shared.environments import ToyEnv
+from hil_tests.tests.shared.messages import HEALTH, make_command, make_state
+from hil_tests.tests.shared.policies import TASK
 
 ALONG_Y = messages.SeenCar(
     x=5.0, y=2.0, heading_rad=math.pi / 2, length_m=4.0, width_m=2.0, ego=True

@@ -22,10 +22,10 @@ from edge_runtime.config import Config
 from edge_runtime.policy import Policy, load_policy
 from edge_runtime.reach import free_endpoint
 from edge_runtime.transport import open_session
-from hil_tests.testing.commands import call
-from hil_tests.testing.drives import make_policy, read, start_edge
-from hil_tests.testing.messages import BLACK, WHITE, frames, make_state
-from hil_tests.testing.policies import T, write_rover
+from hil_tests.tests.shared.commands import call
+from hil_tests.tests.shared.drives import make_policy, read, start_edge
+from hil_tests.tests.shared.messages import BLACK, WHITE, frames, make_state
+from hil_tests.tests.shared.policies import T, write_rover
 
 
 @pytest.fixture(autouse=True)

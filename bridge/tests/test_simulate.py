@@ -25,9 +25,9 @@ from edge_runtime.reach import free_endpoint
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
 from hil_tests.processes import Process, operator
-from hil_tests.testing.drives import TOY, make_policy, read, start_edge, start_simulate
-from hil_tests.testing.messages import make_command
-from hil_tests.testing.policies import STEERING, write_policy, write_rover
+from hil_tests.tests.shared.drives import TOY, make_policy, read, start_edge, start_simulate
+from hil_tests.tests.shared.messages import make_command
+from hil_tests.tests.shared.policies import STEERING, write_policy, write_rover
 
 
 def drive_in_process(policy_path: Path, seed: int) -> tuple[str, np.ndarray]:

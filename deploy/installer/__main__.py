@@ -33,7 +33,6 @@ COMMANDS = {
 
 
 def main(argv: list[str]) -> int:
-    """Run one command and return its exit status."""
     os.umask(0o022)  # The service's user must read the release, whatever the caller's umask.
     return run_cli(_run, argv)
 
@@ -103,11 +102,7 @@ def status(releases: Releases, service: Systemd | None) -> int:
 
 
 def install(releases: Releases, service: Systemd | None, path: str, trust: str | None) -> None:
-    """Install or upgrade. Nothing is written before the bundle is verified.
-
-    `trust` is the path of a public key. Raises UserError where the bundle may not be installed
-    here, UnhealthyError where it may not run and the board is as before.
-    """
+    """Install or upgrade with the public key `trust`; first of all, the bundle is verified."""
     kept = releases.trusted.read_text(errors="replace") if releases.trusted.exists() else None
     key = release.read_public_key(trust) if trust is not None else kept
     if key is None:
@@ -125,7 +120,6 @@ def install(releases: Releases, service: Systemd | None, path: str, trust: str |
 
 
 def rollback(releases: Releases, service: Systemd | None) -> None:
-    """Go back to the release before."""
     with releases.locked():
         version, before = releases.linked(PREVIOUS), releases.linked(BEFORE)
         if before and version != releases.linked(CURRENT):
@@ -136,17 +130,13 @@ def rollback(releases: Releases, service: Systemd | None) -> None:
 
 
 def _activate(releases: Releases, service: Systemd | None, version: str) -> None:
-    """Prove a release and switch to it. UnhealthyError where the board stays or is as before.
-
-    With a service the vehicle hears nothing of a release that is being judged.
-    """
+    """Prove a release and switch to it. UnhealthyError where the board stays or is as before."""
     _prove(releases.folder(version), service)
     releases.prepare()
     if service is None:
         releases.link(CURRENT, version)
     else:
-        with releases.holding(service.group()):
-            _switch(releases, service, version)
+        _switch(releases, service, version)
     if releases.linked(BEFORE) != version:  # It is where `rollback` goes from now on.
         releases.move(BEFORE, PREVIOUS)
 
@@ -164,7 +154,7 @@ def _prove(folder: Path, service: Systemd | None) -> None:
 
 def _switch(releases: Releases, service: Systemd, version: str) -> None:
     """Stop, switch and start; whatever goes wrong, start what was good."""
-    good = releases.good()
+    good = releases.linked(BEFORE)
     try:
         service.stop()
         # Units first: `choose` knows by them who runs an installation that was cut off.

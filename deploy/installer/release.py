@@ -8,10 +8,9 @@ ROOT/releases/VERSION/       whole releases only; the one installer at work lock
 ROOT/current  -> releases/V  the release that the service runs
 ROOT/previous -> releases/V  the release that `rollback` goes back to
 ROOT/.before  -> releases/V  during a switch: the release that was current before it
-ROOT/state/hold              locked during a switch, and then the service sends no command
 
 Each link changes by one rename. A release that no link names is removed; a folder is one only with
-its contents.json. ROOT/state is the installer's alone. All else in ROOT stays.
+its contents.json. All else in ROOT stays.
 
 A release holds the bundle's files, and
 
@@ -83,11 +82,7 @@ class Manifest(NamedTuple):
 
 
 def read_bundle(path: PathLike, trusted: str) -> tuple[Manifest, dict[str, bytes]]:
-    """Read a bundle that the owner of the key `trusted` has signed: manifest, and files by path.
-
-    It is read once, verified and used from memory, so nobody can change it in between.
-    Raises UserError, having written nothing.
-    """
+    """Read a bundle once; UserError where the owner of the key `trusted` has not signed it."""
     data = read_bytes(path, "bundle", _MAX_BUNDLE_MIB)
     with tempfile.NamedTemporaryFile("w") as signers:
         signers.write(f"owner {trusted}\n")
@@ -139,7 +134,6 @@ class Releases:
         self.root = Path(os.path.abspath(root))
         self.trusted = self.root / "trusted.pub"
         self._releases = self.root / "releases"
-        self.hold = self.root / "state/hold"
 
     def folder(self, version: str) -> Path:
         return self._releases / version
@@ -151,15 +145,11 @@ class Releases:
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
-        """Be the only installer here; before and after, remove what no link names.
-
-        Raises UserError where another installer is at work, or a link's place is taken.
-        """
+        """Be the only installer here; before and after, remove what no link names."""
         for link in (self.root / name for name in LINKS):
             if link.exists() and not link.is_symlink():
                 raise UserError(f"{link} is no link of an installation; move it away")
-        for folder in (self._releases, self.hold.parent):
-            folder.mkdir(parents=True, exist_ok=True)
+        self._releases.mkdir(parents=True, exist_ok=True)
         with contextlib.ExitStack() as undo:
             lock = os.open(self._releases, os.O_RDONLY)  # No program that is started inherits it.
             undo.callback(os.close, lock)
@@ -178,24 +168,6 @@ class Releases:
             if is_release and path.name not in named:
                 shutil.rmtree(path, ignore_errors=True)
 
-    @contextlib.contextmanager
-    def holding(self, gid: int) -> Iterator[None]:
-        """Keep the service from sending any command (`hold` in its settings).
-
-        The lock ends with this process, however that ends. Whoever may read the file could lock
-        it, too: only the service's group `gid` may.
-        """
-        with open(os.open(self.hold, os.O_RDWR | os.O_CREAT, 0o600), "rb") as stream:
-            os.fchown(stream.fileno(), -1, gid)
-            os.fchmod(stream.fileno(), 0o640)
-            if not try_to_lock_file(stream.fileno()):
-                raise UserError(f"another process has locked {self.hold}")
-            yield
-
-    def good(self) -> str | None:
-        """The version to go back to: of a switch that was cut off, the one before it."""
-        return self.linked(BEFORE if os.path.lexists(self.root / BEFORE) else CURRENT)
-
     def prepare(self) -> None:
         """Note what is current: going back is then one rename, which needs no room on the disk."""
         if not os.path.lexists(self.root / BEFORE):  # There is one already after a cut-off switch.
@@ -208,7 +180,6 @@ class Releases:
         self.move(".next", name)
 
     def move(self, link: str, to: str) -> None:
-        """Let one link take another's place."""
         os.replace(self.root / link, self.root / to)
         os.sync()
 
@@ -252,7 +223,6 @@ class Releases:
         for name in LINKS:
             self._unlink(name)
         self._tidy()
-        shutil.rmtree(self.hold.parent)
         self._unlink(self.trusted.name)
         with contextlib.suppress(OSError):  # What else lies there stays.
             self._releases.rmdir()
@@ -269,10 +239,7 @@ def _contents(folder: Path) -> bytes:
 
 
 def unpack_wheel(data: bytes, site: Path) -> None:
-    """Write a wheel's packages into `site`, without pip, which a board may lack (PEP 427).
-
-    Scripts and data files stay out. No name leaves `site`: zipfile sees to that.
-    """
+    """Write a wheel's packages into `site`; a board may lack pip. Scripts and data stay out."""
     with zipfile.ZipFile(io.BytesIO(data)) as wheel:
         for member in wheel.infolist():
             folder, _, rest = member.filename.partition("/")

@@ -44,10 +44,7 @@ class Systemd:
         return pwd.getpwnam(USER).pw_gid
 
     def try_release(self, folder: Path) -> None:
-        """Run a release heard by nobody, and let the user's group read its TLS key from now on.
-
-        Raises UnhealthyError unless it says READY=1 within the limit and goes on with WATCHDOG=1.
-        """
+        """Run a release heard by nobody, and give the user's group its TLS key. UnhealthyError."""
         protocol, group = "tcp", self.group()
         for path in (folder / TLS).glob("*"):
             protocol = "tls"
@@ -84,7 +81,6 @@ class Systemd:
                 _run("systemctl", "stop", TRIAL_UNIT, check=False)
 
     def stop(self) -> None:
-        """End the service, if there is one."""
         if (UNIT_FOLDER / MAIN_UNIT).exists():
             _run("systemctl", "stop", MAIN_UNIT)
 
@@ -97,17 +93,12 @@ class Systemd:
         _run("systemctl", "enable", MAIN_UNIT, CAN_UNIT)
 
     def start(self) -> None:
-        """Start the release that `current` names. Raises UnhealthyError where it does not run well.
-
-        `systemctl start` waits for READY=1 as long as the unit and what it comes after allow.
-        systemd ends a service that does not go on with WATCHDOG=1.
-        """
+        """Start the release that `current` names, and wait for READY=1. Raises UnhealthyError."""
         _run("systemctl", "reset-failed", MAIN_UNIT, check=False)
         _run("systemctl", "start", MAIN_UNIT)
         _require_active(MAIN_UNIT)
 
     def describe(self) -> str:
-        """The service's state, such as "active"."""
         return _run("systemctl", "is-active", MAIN_UNIT, check=False).strip()
 
     def remove(self) -> None:
@@ -122,7 +113,6 @@ def choose(service: str | None, root: Path) -> Systemd | None:
     """Return the service of `--service`, None where somebody else runs the release.
 
     Without the option an installation stays as it is, and a first one takes systemd where it runs.
-    Raises UserError where nobody would stop the unit that runs this board.
     """
     has_unit = (UNIT_FOLDER / MAIN_UNIT).exists()
     if service == "none" and has_unit:

@@ -15,7 +15,7 @@ from deploy.bundle import NAME, build_edge_wheel, build_installer, make_bundle
 from deploy.certs import write_key_pair
 from deploy.installer.release import Manifest
 from edge_runtime.reach import free_endpoint
-from hil_tests.testing.policies import public_pem, write_policy
+from hil_tests.tests.shared.policies import public_pem, write_policy
 
 HERE = (f"{sys.version_info[0]}.{sys.version_info[1]}", platform.machine(), "2.17")
 

@@ -23,7 +23,7 @@ class ProcessService(Systemd):
 
     def __init__(self, service: object, root: Path) -> None:
         self._current = root / CURRENT
-        self._pid, self._log = root / "state/pid", root / "state/log"
+        self._pid, self._log = root.with_suffix(".pid"), root.with_suffix(".log")
 
     def group(self) -> int:
         return os.getgid()

@@ -16,7 +16,7 @@ from deploy.bundle import build_edge_wheel, build_installer, gather
 from deploy.installer.release import Releases, read_bundle, read_public_key
 from edge_runtime.config import load_config
 from edge_runtime.util import UserError
-from hil_tests.testing.commands import exit_status, refusal
+from hil_tests.tests.shared.commands import exit_status, refusal
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def test_the_same_inputs_give_the_same_bytes_and_others_another_version(workshop
 
 def test_it_holds_what_the_board_needs_and_nothing_else(workshop, party, tmp_path):
     config, driver = tmp_path / "c.toml", tmp_path / "my_vehicle-0.1.0-py3-none-any.whl"
-    config.write_text('connect = "tls/10.0.0.1:7447"\narmed_at_start = true\nvehicle = "rover"\n')
+    config.write_text('connect = "tls/10.0.0.1:7447"\nvehicle = "rover"\n')
     shutil.copy(workshop.host, driver)
     wheels = [workshop.edge_wheel, driver]
     path, _ = workshop.make(tls=party / "edge-hunter01", config=config, wheels=wheels)
@@ -55,16 +55,20 @@ def test_it_holds_what_the_board_needs_and_nothing_else(workshop, party, tmp_pat
     assert workshop.key.read_bytes() not in contents.values()
     (tmp_path / "board.toml").write_bytes(contents["config.toml"])
     read_back = load_config(tmp_path / "board.toml", {})
-    names = ("connect", "vehicle", "policy", "tls", "hold", "is_armed_at_start")
+    names = ("connect", "vehicle", "policy", "tls", "is_armed_at_start")
     assert [getattr(read_back, name) for name in names] == [
-        "tls/10.0.0.1:7447", "rover", "policy.onnx", "tls/", "../../state/hold", False,
+        "tls/10.0.0.1:7447", "rover", "policy.onnx", "tls/", False,
     ]  # fmt: skip
 
 
 @pytest.mark.parametrize(
     ("text", "name"),
     [
-        *(('policy = "other.onnx"', ""), ('hold = "x"', ""), ("allow_unsigned = true", "")),
+        *(
+            ('policy = "other.onnx"', ""),
+            ("armed_at_start = true", ""),
+            ("allow_unsigned = true", ""),
+        ),
         *(("no toml", ""), ('connect = "tls/10.0.0.1:7447"', "")),  # without certificates
         ('[vehicle]\ndriver = "hunter"\nhunter.speed = 3', ""),
         ('[vehicle]\ndriver = "mock"\nmock.slew_per_s = -1.0', ""),

@@ -10,7 +10,7 @@ from deploy.__main__ import main
 from deploy.certs import _PEM, _pem, issue, read_authority
 from edge_runtime.tls import load_tls
 from edge_runtime.util import UserError
-from hil_tests.testing.commands import call, exit_status, refusal
+from hil_tests.tests.shared.commands import call, exit_status, refusal
 
 ROLES = ("edge", "simulator", "operator", "shadow")
 PARTIES = {"router", "viewer", *(f"{role}-hunter01" for role in ROLES)}

@@ -14,7 +14,7 @@ from deploy.installer import release
 from deploy.installer.release import MANIFEST, Releases, read_bundle, read_public_key, unpack_wheel
 from deploy.tests.boards import HERE
 from edge_runtime.util import UserError
-from hil_tests.testing.policies import public_pem
+from hil_tests.tests.shared.policies import public_pem
 
 KEY = Ed25519PrivateKey.from_private_bytes(bytes(32))
 FOREIGN = public_pem(ec.generate_private_key(ec.SECP256R1()))

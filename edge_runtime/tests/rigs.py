@@ -5,8 +5,8 @@ vehicle that obeys it at once, or not.
 import math
 import threading
 
-from hil_tests.testing.policies import FRAMES, STEERING, T
-from hil_tests.testing.policies import PEDAL as PEDAL_ACTION
+from hil_tests.tests.shared.policies import FRAMES, STEERING, T
+from hil_tests.tests.shared.policies import PEDAL as PEDAL_ACTION
 
 from edge_runtime.manifest import Car, Manifest
 from edge_runtime.vehicles.hunter import HunterCore, protocol

@@ -5,7 +5,7 @@ import math
 from typing import Any
 
 import pytest
-from hil_tests.testing.policies import T
+from hil_tests.tests.shared.policies import T
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -40,7 +40,7 @@ def test_a_cap_above_the_models_limit_is_refused(name, place):
                 vehicle_limits(name, {}, a_manifest(), bounds)
         else:
             vehicle_limits(name, {}, a_manifest(), bounds)
-    assert find_vehicle(name).model_limits_of({}, a_manifest())[:2] == pytest.approx(MODEL[name])
+    assert find_vehicle(name).limits_of({}, a_manifest())[1][:2] == pytest.approx(MODEL[name])
 
 
 def test_an_angle_that_a_driver_does_not_know_is_not_capped():

@@ -12,9 +12,9 @@ from pathlib import Path
 import msgspec
 import pytest
 from hil_tests.processes import Process, wait_until
-from hil_tests.testing.commands import exit_status, run_command
-from hil_tests.testing.messages import HEALTH, make_feedback
-from hil_tests.testing.policies import write_policy
+from hil_tests.tests.shared.commands import exit_status, run_command
+from hil_tests.tests.shared.messages import HEALTH, make_feedback
+from hil_tests.tests.shared.policies import write_policy
 
 import edge_runtime
 from edge_runtime import __main__ as commands

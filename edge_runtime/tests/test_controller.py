@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from hil_tests.testing.messages import make_state
-from hil_tests.testing.policies import PEDAL, STEERING
+from hil_tests.tests.shared.messages import make_state
+from hil_tests.tests.shared.policies import PEDAL, STEERING
 from msgspec.structs import replace
 
 from edge_runtime.controller import (

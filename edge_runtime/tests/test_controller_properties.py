@@ -11,8 +11,8 @@ from typing import Any, Optional
 import msgspec
 import numpy as np
 import pytest
-from hil_tests.testing.messages import make_state
-from hil_tests.testing.policies import PEDAL, STEERING
+from hil_tests.tests.shared.messages import make_state
+from hil_tests.tests.shared.policies import PEDAL, STEERING
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, rule, run_state_machine_as_test

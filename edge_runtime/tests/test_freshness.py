@@ -8,8 +8,8 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from hil_tests.testing.messages import make_state
-from hil_tests.testing.policies import PEDAL
+from hil_tests.tests.shared.messages import make_state
+from hil_tests.tests.shared.policies import PEDAL
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

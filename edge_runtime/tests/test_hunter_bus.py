@@ -20,7 +20,6 @@ from edge_runtime.vehicles import hunter, streamed
 from edge_runtime.vehicles.hunter import (
     DEFAULT_BUS,
     MULTICAST_BUS,
-    BusName,
     HunterSettings,
     HunterVehicle,
     open_bus,
@@ -169,13 +168,17 @@ def test_only_commands_are_sent(channel, vehicle):
         assert other.recv(0.0) is None
 
 
+def bus_name(interface, channel, options):
+    return {"interface": interface, "channel": channel, **options}
+
+
 ON_LOOPBACK = {"port": 7, "hop_limit": 0, "fd": False}
 BUSES = {
-    "socketcan:can0": BusName("socketcan", "can0", {}),
-    "slcan:/dev/ttyACM0": BusName("slcan", "/dev/ttyACM0", {"bitrate": 500_000}),
-    "slcan:tty:7": BusName("slcan", "tty:7", {"bitrate": 500_000}),
-    "virtual:tty:7": BusName("virtual", "tty:7", {}),
-    "udp_multicast:239.1.2.3:7": BusName("udp_multicast", "239.1.2.3", ON_LOOPBACK),
+    "socketcan:can0": bus_name("socketcan", "can0", {}),
+    "slcan:/dev/ttyACM0": bus_name("slcan", "/dev/ttyACM0", {"bitrate": 500_000}),
+    "slcan:tty:7": bus_name("slcan", "tty:7", {"bitrate": 500_000}),
+    "virtual:tty:7": bus_name("virtual", "tty:7", {}),
+    "udp_multicast:239.1.2.3:7": bus_name("udp_multicast", "239.1.2.3", ON_LOOPBACK),
     **dict.fromkeys(("can0", ":can0", "socketcan:", "udp_multicast:239.1.2.3")),
 }
 

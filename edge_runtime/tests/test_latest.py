@@ -1,8 +1,8 @@
 from collections import Counter
 
 import pytest
-from hil_tests.testing.messages import make_state
-from hil_tests.testing.policies import T
+from hil_tests.tests.shared.messages import make_state
+from hil_tests.tests.shared.policies import T
 from hypothesis import given
 from hypothesis import strategies as st
 

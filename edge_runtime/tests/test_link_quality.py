@@ -5,7 +5,7 @@ import random
 from typing import Any
 
 import pytest
-from hil_tests.testing.messages import make_state
+from hil_tests.tests.shared.messages import make_state
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from hil_tests.testing.policies import T
+from hil_tests.tests.shared.policies import T
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -12,7 +12,7 @@ import onnx
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
-from hil_tests.testing.policies import (
+from hil_tests.tests.shared.policies import (
     PEDAL,
     ROVER,
     ROVER_INPUTS,

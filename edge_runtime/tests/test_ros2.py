@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import zenoh
 from hil_tests.processes import wait_until
-from hil_tests.testing.drives import Simulator, run_edge
+from hil_tests.tests.shared.drives import Simulator, run_edge
 from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore

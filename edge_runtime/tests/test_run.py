@@ -1,7 +1,6 @@
 """The real process against a real simulator session. Limits are loose: machines are busy."""
 
 import contextlib
-import fcntl
 import itertools
 import os
 import re
@@ -11,10 +10,10 @@ from typing import Any
 
 import pytest
 from hil_tests.processes import Process, wait_until
-from hil_tests.testing.commands import run_command
-from hil_tests.testing.drives import Simulator, run_edge
-from hil_tests.testing.messages import WHITE, frames, make_state
-from hil_tests.testing.policies import T
+from hil_tests.tests.shared.commands import run_command
+from hil_tests.tests.shared.drives import Simulator, run_edge
+from hil_tests.tests.shared.messages import WHITE, frames, make_state
+from hil_tests.tests.shared.policies import T
 
 from edge_runtime.reach import free_endpoint
 
@@ -306,33 +305,3 @@ def test_of_two_runtimes_that_meet_later_the_younger_gives_way(make_policy):
         assert simulator.ask(make_state(0, final=True)).mode == "drive"
         (left,) = set(edges) - set(ended)
         assert left.end() == 0
-
-
-def test_a_runtime_on_hold_hears_and_says_nothing(edge_and_simulator, tmp_path):
-    settings, steps, hold = tmp_path / "edge.toml", itertools.count(), tmp_path / "hold"
-    settings.write_text(f"vehicle = 'mock'\nhold = '{hold}'\n")
-    installer = hold.open("w")
-    fcntl.flock(installer, fcntl.LOCK_EX)
-    edge, simulator = edge_and_simulator("constant", "--config", str(settings))
-
-    def feed(count):
-        for step in itertools.islice(steps, count):
-            simulator.send(make_state(step))
-            time.sleep(0.05)
-
-    feed(10)
-    assert wait_until(lambda: simulator.health[-1].accepted, "accepted states")
-    assert simulator.commands.empty()
-    # The vehicle has taken no command: its feedback names the last one.
-    assert {feedback.step for feedback in simulator.feedback} == {-1}
-    answer = simulator.query("rearm")
-    assert not answer["accepted"]
-    assert "installer" in answer["detail"]
-    installer.close()
-    feed(6)
-    # Nobody has seen what the vehicle would do: it waits for its operator, armed at start or not.
-    command = simulator.next_command()
-    assert (command.session, command.reason) == ("simulator-a", "not_armed")
-    simulator.steps = steps
-    simulator.drive_until(lambda: simulator.feedback[-1].mode == "drive", "a drive", rearms=True)
-    assert edge.end() == 0

@@ -1,7 +1,7 @@
 from pathlib import Path
 
 import pytest
-from hil_tests.testing.policies import T
+from hil_tests.tests.shared.policies import T
 
 import edge_runtime
 from edge_runtime import safety as rules

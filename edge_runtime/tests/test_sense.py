@@ -11,9 +11,9 @@ import msgspec
 import numpy as np
 import pytest
 from hil_tests.processes import Process, wait_until
-from hil_tests.testing.commands import call
-from hil_tests.testing.drives import make_policy, run_edge
-from hil_tests.testing.policies import PEDAL, ROVER, SHAPE, TASK, T, write_policy
+from hil_tests.tests.shared.commands import call
+from hil_tests.tests.shared.drives import make_policy, run_edge
+from hil_tests.tests.shared.policies import PEDAL, ROVER, SHAPE, TASK, T, write_policy
 from hypothesis import example, given
 from hypothesis import strategies as st
 

@@ -1,6 +1,7 @@
 """The runtime as a service, and its loop: real threads between a fake policy and a fake link."""
 
 import contextlib
+import math
 import os
 import signal
 import socket
@@ -12,9 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 from hil_tests.processes import wait_until
-from hil_tests.testing.drives import run_edge
-from hil_tests.testing.messages import make_state
-from hil_tests.testing.policies import PEDAL, TASK, T
+from hil_tests.tests.shared.drives import run_edge
+from hil_tests.tests.shared.messages import make_state
+from hil_tests.tests.shared.policies import PEDAL, TASK, T
 
 from edge_runtime import log, loop
 from edge_runtime.controller import Controller, ControllerConfig, shared_limits
@@ -115,7 +116,7 @@ def test_a_service_from_its_start_to_its_end(make_policy, systemd):
 
 
 def test_a_systemd_that_is_gone_or_full_holds_nobody(tmp_path):
-    assert Notifier({"WATCHDOG_USEC": "3000000", "WATCHDOG_PID": "1"}).watchdog_period_s is None
+    assert Notifier({"WATCHDOG_USEC": "3000000", "WATCHDOG_PID": "1"}).watchdog_period_s == math.inf
     end = Systemd(str(tmp_path / "notify"))
     notifier = end.notifier()
     for _ in range(2000):  # more than the socket takes

@@ -1,6 +1,5 @@
 """Files that a command reads and writes, and the signals that end it."""
 
-import fcntl
 import json
 import os
 import signal
@@ -15,7 +14,6 @@ from edge_runtime.cli import run_cli, sigterm_as_interrupt
 from edge_runtime.config import load_config
 from edge_runtime.files import check_writable, write_atomic, write_json_out
 from edge_runtime.policy import MAX_POLICY_MIB, load_policy
-from edge_runtime.service import Hold
 from edge_runtime.util import UserError, read_bytes
 
 
@@ -74,19 +72,6 @@ def test_run_cli_turns_errors_into_one_line(capfd, error, status):
     assert run_cli(fails, []) == status
     os.dup2(stdout, 1)
     assert capfd.readouterr().err.count("\n") == 1
-
-
-def test_a_hold_lasts_as_long_as_a_lock(tmp_path):
-    with (tmp_path / "hold").open("w") as installer:
-        hold = Hold(installer.name)
-        fcntl.flock(installer, fcntl.LOCK_EX)
-        assert hold.is_on()
-        assert hold.refusal()
-        for change in (fcntl.LOCK_UN, fcntl.LOCK_EX):  # once free, it is free
-            fcntl.flock(installer, change)
-            assert not hold.is_on()
-            assert hold.refusal() == ""
-    assert not Hold(str(tmp_path / "absent")).is_on()
 
 
 READERS = {

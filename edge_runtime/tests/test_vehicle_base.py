@@ -7,8 +7,8 @@ import msgspec
 import numpy as np
 import pytest
 from hil_tests.processes import wait_until
-from hil_tests.testing.messages import make_command
-from hil_tests.testing.policies import T
+from hil_tests.tests.shared.messages import make_command
+from hil_tests.tests.shared.policies import T
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

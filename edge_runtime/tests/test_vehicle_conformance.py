@@ -4,7 +4,7 @@ import math
 from typing import Any
 
 import pytest
-from hil_tests.testing.policies import T
+from hil_tests.tests.shared.policies import T
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -9,8 +9,8 @@ from typing import Any
 import msgspec
 import pytest
 from hil_tests.processes import wait_until
-from hil_tests.testing.drives import Simulator
-from hil_tests.testing.messages import make_state
+from hil_tests.tests.shared.drives import Simulator
+from hil_tests.tests.shared.messages import make_state
 
 import edge_runtime
 from edge_runtime.config import BUILT_IN

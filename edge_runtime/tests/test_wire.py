@@ -3,8 +3,8 @@ from typing import Any, Dict, List, Optional, Union, get_type_hints
 
 import msgspec
 import pytest
-from hil_tests.testing.messages import HEALTH, make_command, make_state
-from hil_tests.testing.policies import SIZE, TASK
+from hil_tests.tests.shared.messages import HEALTH, make_command, make_state
+from hil_tests.tests.shared.policies import SIZE, TASK
 from hypothesis import given
 from hypothesis import strategies as st
 

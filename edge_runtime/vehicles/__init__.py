@@ -10,12 +10,11 @@ import difflib
 import math
 from importlib import import_module
 from importlib.metadata import entry_points
-from numbers import Real
 from typing import Any, Callable, Iterable, Mapping, Tuple, Type, TypeVar
 
 from edge_runtime.bounds import NO_BOUNDS, Bounds, check_bounds, narrowed
 from edge_runtime.config import BUILT_IN, NONE
-from edge_runtime.controller import ActionLimit, Limits
+from edge_runtime.controller import Limits
 from edge_runtime.manifest import Manifest
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.base import Vehicle, close_in_time
@@ -26,10 +25,7 @@ Tables = Mapping[str, Mapping[str, Any]]  # [vehicle.NAME] of the settings, by n
 
 
 def make_vehicle(name: str, tables: Tables, manifest: Manifest) -> Vehicle:
-    """Open the driver of a name for a policy. Nothing is sent before it is enabled.
-
-    Raises UserError where there is none, for its settings, and where it cannot be opened.
-    """
+    """Open the driver of a name for a policy; UserError where that fails. Nothing is sent."""
     kind, settings = _find(name, tables)
     vehicle = _call(name, kind.open, settings, manifest)
     check_driver(vehicle)
@@ -50,32 +46,23 @@ def check_driver(vehicle: Any) -> None:
 def vehicle_limits(
     name: str, tables: Tables, manifest: Manifest, bounds: Bounds = NO_BOUNDS
 ) -> Limits:
-    """Return the limits of the vehicle of a name without opening anything; of "none": {}.
-
-    They are cut to the operator's bounds. Raises UserError where there is none, and for its
-    settings.
-    """
+    """Return the limits of a vehicle within the bounds, opening nothing; of "none": {}."""
     if name == NONE:
         return {}
     kind, settings = _find(name, tables)
-    limits = _checked(name, _call(name, kind.limits_of, settings, manifest))
-    if bounds == NO_BOUNDS:
-        return limits
-    model = _call(name, kind.model_limits_of, settings, manifest)
+    limits, model = _call(name, kind.limits_of, settings, manifest)
     check_bounds(bounds, model, name)
-    return narrowed(limits, bounds, model)
+    return narrowed(_checked(name, limits), bounds, model)
 
 
 def _checked(name: str, limits: Any) -> Limits:
     """Return the limits. Raises UserError for what a comparison would let through, or fail on."""
-
-    def is_limit(limit: Any) -> bool:
-        if not isinstance(limit, ActionLimit) or not all(isinstance(n, Real) for n in limit[:3]):
-            return False
-        return -math.inf < limit.low <= limit.high < math.inf and limit.slew_per_s > 0.0
-
-    if limits and isinstance(limits, dict) and all(map(is_limit, limits.values())):
-        return limits
+    with contextlib.suppress(AttributeError, TypeError):
+        rows = limits.values()
+        within = (-math.inf < row.low <= row.high < math.inf and row.slew_per_s > 0 for row in rows)
+        if rows and all(within):
+            checked: Limits = limits
+            return checked
     form = "{'pedal': ActionLimit(-1.0, 1.0)} of edge_runtime.controller, low <= high, slew > 0"
     raise UserError(f"vehicle {name}: its limits must be like {form}, not {limits!r}")
 
@@ -108,10 +95,7 @@ def find_vehicle(name: str) -> Type[Vehicle]:
 
 
 def installed_as(own_name: str) -> str:
-    """Return the installed name of the driver that calls itself `own_name`, as a recording has it.
-
-    Where none is installed it is `own_name` itself.
-    """
+    """Return the installed name of the driver that calls itself `own_name`, if there is one."""
     for point in _others():
         with contextlib.suppress(UserError):
             if find_vehicle(point.value).name == own_name:

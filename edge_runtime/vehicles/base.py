@@ -11,7 +11,7 @@ import abc
 import threading
 import time
 from functools import partial
-from typing import Any, Callable, ClassVar, Mapping, NamedTuple, Optional, Sequence
+from typing import Any, Callable, ClassVar, Mapping, NamedTuple, Optional, Sequence, Tuple
 
 from edge_runtime import log
 from edge_runtime.bounds import NO_BOUNDS, Bounds, Leash, Model, check_bounds, narrowed
@@ -56,14 +56,14 @@ class Vehicle(abc.ABC):
         return cls(**settings)
 
     @classmethod
-    def limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Limits:
-        """Return `limits` of the driver to be, by default the class's. Opens nothing."""
-        return cls.limits
+    def limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Tuple[Limits, Model]:
+        """Return `limits` and `model_limits` of the driver to be, by default the class's."""
+        return cls.limits, cls.model_limits
 
-    @classmethod
-    def model_limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Model:
-        """Return `model_limits` of the driver to be, by default the class's. Opens nothing."""
-        return cls.model_limits
+    @property
+    def allowed_limits(self) -> Limits:
+        """`limits`, cut to the operator's bounds."""
+        return narrowed(self.limits, self.allowed, self.model_limits)
 
     def take_bounds(self, bounds: Bounds) -> None:
         """Take the operator's bounds, before `enable`. UserError where the model's are below."""
@@ -148,7 +148,7 @@ class VehicleRunner:
         self.on_fault: Callable[[], None] = lambda: None
         self._vehicle, self._action_names, self._publish = vehicle, action_names, publish
         self.allowed = vehicle.allowed
-        self._limits = narrowed(vehicle.limits, vehicle.allowed, vehicle.model_limits)
+        self._limits = vehicle.allowed_limits
         self.leash = Leash(vehicle.allowed.leash_m)
         self._watch = VehicleWatch(
             vehicle.control_period_s, vehicle.limits, vehicle.allowed.max_speed_mps
@@ -194,10 +194,7 @@ class VehicleRunner:
         return self._seen_fault(now_s) or (heard.standing[0] if heard and heard.standing else "")
 
     def start(self, armed: bool = True) -> None:
-        """Start the vehicle's feedback, and enable it unless that is to wait for an operator.
-
-        Raises UserError where it cannot be enabled.
-        """
+        """Start the feedback, and enable the vehicle where `armed`; UserError where that fails."""
         self._enable_due = armed
         self._watch.begin(time.monotonic())
         self._thread.start()
@@ -207,10 +204,7 @@ class VehicleRunner:
             raise UserError(f"vehicle {self.name} cannot be enabled: {words}")
 
     def enable(self) -> None:
-        """Have the vehicle enabled again: an operator has re-armed it.
-
-        A command that is still on its way is dropped: a stop from before would undo it.
-        """
+        """Enable the vehicle again, after a re-arm. A stop from before, on its way, is dropped."""
         with self._due:
             self._enable_due, self._next = True, None
             self._due.notify()
@@ -218,11 +212,7 @@ class VehicleRunner:
     def command(
         self, command: Command, scenario_speed_mps: Optional[float] = None, latch: bool = True
     ) -> None:
-        """Hand on a command, in place of one that the driver has not taken yet.
-
-        `scenario_speed_mps` is that of the state it answers. A safe stop with `latch` False may
-        be followed by a drive without `enable`.
-        """
+        """Hand on a command in place of the last; not `latch`: a stop that needs no `enable`."""
         with self._due:
             self._next = _Order(command, scenario_speed_mps, latch, time.monotonic())
             self._due.notify()
@@ -359,11 +349,7 @@ class VehicleRunner:
 
 
 def _plain(report: VehicleReport, names: Sequence[str]) -> VehicleReport:
-    """Return the report in Python's own types: a driver's numbers may be numpy's.
-
-    Raises for what is no report, and where an action of these names is missing: nobody could see
-    whether the vehicle obeys.
-    """
+    """Return the report in Python's own types; raises where it is none, or lacks one of `names`."""
     action = {name: float(value) for name, value in report.action.items()}
     if lacking := [name for name in names if name not in action]:
         raise ValueError(f"feedback without {', '.join(lacking)}")

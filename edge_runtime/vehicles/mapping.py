@@ -47,11 +47,7 @@ class HunterSpec(NamedTuple):
     max_steering_rate_radps: float
 
     def inner_rad(self, centre_rad: float) -> float:
-        """Return the inner wheel's angle for a centre angle, within its limit.
-
-        The inner wheel's circle is half a track narrower: tan(inner) = wheelbase / (radius -
-        track/2) with the radius wheelbase / tan(centre) of the rear axle's middle (Ackermann).
-        """
+        """Return the inner wheel's angle for a centre angle (Ackermann), within its limit."""
         most_rad = self.centre_rad(self.max_inner_steering_rad)
         return self._turned(min(abs(centre_rad), most_rad), centre_rad, -0.5 * self.track_m)
 
@@ -92,10 +88,7 @@ class Similarity(NamedTuple):
         return clamp(acceleration_mps2 / self.scale / full_mps2, 1.0)
 
     def centre_rad(self, steering: float) -> float:
-        """Return the angle of a wheel in the middle of the front axle, for a steering in -1 to 1.
-
-        The robot is a bicycle that turns about its rear axle: tan(angle) = wheelbase x curvature.
-        """
+        """Return the centre angle for a steering: the robot is a bicycle about its rear axle."""
         return math.atan(self.spec.wheelbase_m * (self.car.curvature(steering) / self.scale))
 
     def steering(self, centre_rad: float) -> float:
@@ -172,10 +165,7 @@ class Wish(NamedTuple):
 
 
 def wish_of(action: Dict[str, float], scenario_speed_mps: Optional[float]) -> Wish:
-    """Return the command of an action, within -1 to 1.
-
-    Raises ValueError for what is not finite, and for what leaves out how fast to drive.
-    """
+    """Return an action's command, within -1 to 1; ValueError: not finite, or no speed in it."""
     if not all(map(math.isfinite, [*action.values(), scenario_speed_mps or 0.0])):
         raise ValueError(f"a command that is not finite: {action}, {scenario_speed_mps} m/s")
     if not action or ("pedal" not in action and scenario_speed_mps is None):
@@ -195,7 +185,6 @@ class SetPoint:
         self._similarity = similarity
 
     def take_bounds(self, bounds: Bounds) -> None:
-        """Stay within the operator's bounds as well."""
         spec = self.spec
         self.spec = spec._replace(
             max_speed_mps=min(spec.max_speed_mps, bounds.max_speed_mps),

@@ -14,7 +14,7 @@ import msgspec
 
 from edge_runtime.bounds import Model
 from edge_runtime.config import convert
-from edge_runtime.controller import ActionLimit
+from edge_runtime.controller import ActionLimit, Limits
 from edge_runtime.manifest import Manifest
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.base import Vehicle, VehicleReport
@@ -47,9 +47,8 @@ class MockVehicle(Vehicle):
         self, parameters: Optional[MockParameters] = None, full_steering_rad: float = math.inf
     ) -> None:
         self._parameters = parameters or MockParameters()
-        self.model_limits = Model(
-            self._parameters.max_speed_mps, full_steering_rad, full_steering_rad
-        )
+        top_mps = self._parameters.max_speed_mps
+        self.model_limits = Model(top_mps, full_steering_rad, full_steering_rad)
         self._pedal, self._steering, self._speed_mps = -1.0, 0.0, 0.0
         self._now_s, self._commanded_s = math.inf, -math.inf  # its time begins with the first call
         self._on_the_way: Deque[Tuple[float, Tuple[float, float]]] = deque()
@@ -68,12 +67,9 @@ class MockVehicle(Vehicle):
         return cls(parameters, abs(manifest.car.full_steering_rad) if manifest.car else math.inf)
 
     @classmethod
-    def limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Dict[str, ActionLimit]:
-        return cls.open(settings, manifest).limits  # It opens nothing.
-
-    @classmethod
-    def model_limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Model:
-        return cls.open(settings, manifest).model_limits
+    def limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Tuple[Limits, Model]:
+        made = cls.open(settings, manifest)  # it opens nothing
+        return made.limits, made.model_limits
 
     def enable(self, now_s: float) -> None:
         """Take a stop back; the brake is on until the first command."""

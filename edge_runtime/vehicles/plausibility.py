@@ -91,7 +91,6 @@ class Asked:
             self.noted.popleft()
 
     def is_full(self, now_s: float) -> bool:
-        """Return whether all of the window before now is known."""
         return bool(self.noted) and self.noted[0][0] <= now_s - self._window_s
 
     @property
@@ -121,7 +120,6 @@ class VehicleWatch:
         return self._reported_s + self._silence_s
 
     def begin(self, now_s: float) -> None:
-        """Expect reports from now on."""
         self._reported_s = now_s
 
     def enable(self, now_s: float) -> None:
@@ -230,10 +228,7 @@ class FollowWatch:
 
 
 class DriveWatch:
-    """Watch whether drive and steering of a streamed vehicle follow its set-point.
-
-    `silence_s` is how old feedback may be.
-    """
+    """Watch whether a streamed vehicle follows its set-point. Feedback may be `silence_s` old."""
 
     def __init__(self, spec: HunterSpec, silence_s: float) -> None:
         full_rad = spec.centre_rad(spec.max_inner_steering_rad)

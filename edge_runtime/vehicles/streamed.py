@@ -110,7 +110,6 @@ class Speeds:
 
     @property
     def stands(self) -> bool:
-        """Whether it stood when it was last heard."""
         return abs(self.speed_mps) < STANDS_MPS
 
     def acceleration_mps2(self) -> float:
@@ -220,7 +219,6 @@ class StreamedCore(abc.ABC):
         self.cause, self.words = finding if after is VehicleState.STOPPED else (None, "")
 
     def _look(self, now_s: float) -> None:
-        """Find what time alone tells."""
         if self.state is VehicleState.ENABLING and now_s - self._since_s > ENABLE_TIMEOUT_S:
             words = f"not enabled within {ENABLE_TIMEOUT_S:.0f} s"
             if why := self._hindrance(now_s):
@@ -252,9 +250,8 @@ class StreamedCore(abc.ABC):
 class StreamedVehicle(Vehicle):
     """A lock around every call of a core, and a thread that sends what the core asks for.
 
-    A driver is made of its settings and the similarity of its robot to the policy's car, and starts
-    `_stream` at the end of `__init__`. Bus and network are called outside of the lock, so that no
-    caller waits for them.
+    A driver starts `_stream` at the end of `__init__`. Bus and network are called outside of the
+    lock, so that no caller waits for them.
     """
 
     settings_type: ClassVar[Type[RobotSettings]]
@@ -270,20 +267,20 @@ class StreamedVehicle(Vehicle):
 
     @classmethod
     def open(cls, settings: Mapping[str, Any], manifest: Manifest) -> Vehicle:
-        given = convert(settings, cls.settings_type, f"vehicle.{cls.name}")
+        given, similarity = cls._read(settings, manifest)
         make: Any = cls  # of each driver's own settings
-        made: Vehicle = make(given, given.similarity(cls.name, manifest))
+        made: Vehicle = make(given, similarity)
         return made
 
     @classmethod
-    def limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Limits:
-        given = convert(settings, cls.settings_type, f"vehicle.{cls.name}")
-        return given.similarity(cls.name, manifest).limits()
+    def limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Tuple[Limits, Model]:
+        _, similarity = cls._read(settings, manifest)
+        return similarity.limits(), similarity.model()
 
     @classmethod
-    def model_limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Model:
+    def _read(cls, settings: Mapping[str, Any], manifest: Manifest) -> Tuple[Any, Similarity]:
         given = convert(settings, cls.settings_type, f"vehicle.{cls.name}")
-        return given.similarity(cls.name, manifest).model()
+        return given, given.similarity(cls.name, manifest)
 
     def take_bounds(self, bounds: Bounds) -> None:
         super().take_bounds(bounds)

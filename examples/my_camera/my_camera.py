@@ -72,13 +72,11 @@ class Pictures(Stacked):
         self.count = -1
 
     def take(self) -> np.ndarray:
-        """Take the next one."""
         self.count += 1
         return self.pictures[self.count % len(self.pictures)]
 
 
 def draw(folder: Path = FOLDER, count: int = 200) -> None:
-    """Draw a line that winds."""
     from PIL import Image, ImageDraw
 
     folder.mkdir()

@@ -28,13 +28,11 @@ class CameraTask(gymnasium.Env):
     action_space = Box(-1.0, 1.0, (2,), np.float32)
 
     def reset(self, *, seed=None, options=None):  # type: ignore[no-untyped-def]
-        """Begin at the first picture."""
         super().reset(seed=seed)
         self.source = Pictures()
         return self.source.observe()["frames"], {}
 
     def step(self, action):  # type: ignore[no-untyped-def]
-        """Show the next picture."""
         return self.source.observe()["frames"], 0.0, False, False, {}
 
     def expert(self) -> "Nobody":

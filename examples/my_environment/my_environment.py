@@ -53,7 +53,6 @@ class Dock(gymnasium.Env):
         return picture
 
     def expert(self) -> "Expert":
-        """Make the scripted human."""
         return Expert(self)
 
     def _seen(self) -> np.ndarray:
@@ -75,7 +74,6 @@ class Expert:
         return np.clip([4.0 * (wanted_mps - self.env.speed_mps)], -2.0, 1.0)
 
     def wants_control(self, policy_action: np.ndarray) -> str | None:
-        """Return why it takes over, or None."""
         speed_mps = self.env.speed_mps + 0.1 * float(policy_action[0])
         if speed_mps > 0.45 and speed_mps**2 > 3.0 * self.env.distance_m:
             return "collision"

@@ -70,7 +70,6 @@ class Rover(Vehicle):
         return VehicleReport({"pedal": pedal, "steering": steering}, speed_mps, bool(braking), [])
 
     def close(self) -> None:
-        """Brake, and free the socket."""
         if self._socket.fileno() >= 0:
             with contextlib.suppress(OSError):  # a rover that is gone brakes by itself
                 self.brake(0.0)

@@ -80,7 +80,6 @@ class Job:
 
     @property
     def edge(self) -> list[str]:
-        """Return the options that name the settings of an edge runtime, if there are any."""
         return ["--config", self.settings.edge] if self.settings.edge else []
 
     def drivers(self, condition: str = NOMINAL) -> Drivers:
@@ -265,7 +264,7 @@ def in_real_time(job: Job) -> Found:
 
 def replay(path: str | Path, job: Job) -> Found:
     assert job.policy is not None
-    report = report_replay(RecordedDrive(Path(path), None), job.policy, job.config)
+    report, _ = report_replay(RecordedDrive(Path(path), None), job.policy, job.config)
     others = [each[:12] for each in report["recorded_policy_ids"] if each != job.policy_id]
     wrong = [f"policy {', '.join(others)} made it"] if others else []
     wrong += [f"{report['different']} answers differ"] if report["different"] else []

@@ -21,14 +21,7 @@ from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.config import convert, load_config
 from edge_runtime.files import check_writable, write_atomic, write_json
 from edge_runtime.policy import MAX_POLICY_MIB, load_policy, policy_id_of
-from edge_runtime.util import (
-    UserError,
-    open_regular,
-    printable,
-    read_bytes,
-    read_json,
-    read_toml,
-)
+from edge_runtime.util import UserError, open_regular, printable, read_bytes, read_json, read_toml
 from edge_runtime.vehicles import vehicle_limits
 from hil_tests.accept import page
 from hil_tests.accept.checks import GATES, Check, Found, Job, table
@@ -159,7 +152,6 @@ def run_checks(job: Job) -> tuple[list[dict[str, Any]], float]:
 
 
 def attempt(check: Check, job: Job) -> dict[str, Any]:
-    """Return a check's row of the report."""
     found, result, why = Found(""), NOT_TRIED, check.skipped
     if not why:
         try:

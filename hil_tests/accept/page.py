@@ -28,7 +28,6 @@ GOOD, BAD, PLAIN = "#2b7a4b", "#b3322e", "#2868b8"
 
 
 def junit(report: Mapping[str, Any]) -> bytes:
-    """Return the checks as JUnit's XML, a test case each."""
     results = [check["result"] for check in report["checks"]]
     counts = {"failures": results.count(FAILED), "skipped": results.count(NOT_TRIED)}
     told = {"name": "accept", "tests": len(results), **counts, "time": report["seconds"]}
@@ -60,7 +59,6 @@ def render(folder: Path, report: Mapping[str, Any]) -> str:
 
 
 def draw_distance(axis: str, found: Mapping[str, Any]) -> Figure:
-    """Draw success against a setting of the network, with the declared link."""
     figure, unit = Figure(figsize=(4.6, 3.0), layout="constrained"), AXES[axis][-1]
     panel, declared = figure.subplots(), found["declared"]
     at, shares = zip(*sorted((float(x), y) for x, y in found["points"].items()), strict=True)
@@ -77,7 +75,6 @@ def draw_distance(axis: str, found: Mapping[str, Any]) -> Figure:
 
 
 def draw_times(found: Mapping[str, Any]) -> Figure:
-    """Draw how long the edge runtime took for its answers, against T."""
     figure = Figure(figsize=(4.6, 3.0), layout="constrained")
     panel, period_ms = figure.subplots(), found["period_ms"]
     times_ms = np.maximum(found["edge_ms"], 0.01)

@@ -14,11 +14,10 @@ from bridge.messages import DECODERS
 from edge_runtime import wire
 from edge_runtime.cli import BAD_INPUT
 from edge_runtime.manifest import Layout, Task
-from edge_runtime.wire import DRIVE, Command, Message, Rejection, encode
+from edge_runtime.wire import DRIVE, Command, Feedback, Message, Rejection, encode
 from hil_tests.faults.rig import Rig, noisy_state
 from hil_tests.faults.rows import Row, Try, drives_on
 from hil_tests.processes import wait_until
-from hil_tests.testing.messages import make_command, make_feedback
 
 FLOOD_PER_S, FLOOD_S = 10_000, 2.0
 COUNT, PER_S = 10_000, 2_500
@@ -123,12 +122,20 @@ def _command(rig: Rig, ahead: int = 0, **changes: object) -> Command:
     """Make a drive command to the newest state, or to one ``ahead`` of it."""
     session, episode, step = rig.timeline.commands[-1].place
     middle = [0.45 * one.low + 0.55 * one.high for one in rig.task.action]
-    fields = {"session": session, "episode": episode, "action": middle, **changes}
-    return make_command(max(0, step + ahead), sent_ns=time.time_ns(), **fields)
+    fields: dict[str, Any] = {
+        "session": session, "episode": episode, "step": max(0, step + ahead), "mode": DRIVE,
+        "action": middle, "policy_id": "p", "received_ns": 1, "inference_ns": 1,
+        "sent_ns": time.time_ns(),
+    }  # fmt: skip
+    return Command(**{**fields, **changes})
 
 
 def garbage_feedback(rig: Rig) -> Try:
-    _put_garbage(rig, "feedback", make_feedback(0, session=_FOREIGN))
+    feedback = Feedback(
+        vehicle="robot", session=_FOREIGN, episode=0, step=0, mode=DRIVE, action=[0.5],
+        speed_mps=1.0, self_braking=False, faults=[], sent_ns=1,
+    )  # fmt: skip
+    _put_garbage(rig, "feedback", feedback)
     return Try()
 
 
@@ -181,7 +188,6 @@ def with_fields(valid: bytes, **changes: object) -> bytes:
 
 
 def without(valid: bytes, name: str) -> bytes:
-    """Remove a field of a MessagePack map."""
     fields = msgspec.msgpack.decode(valid)
     del fields[name]
     return msgspec.msgpack.encode(fields)

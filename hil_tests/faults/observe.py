@@ -27,7 +27,7 @@ from edge_runtime.transport import open_session
 from edge_runtime.vehicles.hunter import open_bus, parse_bus
 from edge_runtime.vehicles.hunter.protocol import FRAMES
 from edge_runtime.wire import DRIVE, SAFE_STOP
-from hil_tests.testing.policies import TASK
+from hil_tests.faults.policies import TASK
 
 REACTION_LIMIT_S = 2 * TASK.control_period_s + 0.05
 """After the last good state a safe stop is out, or the other end brakes by itself."""
@@ -64,12 +64,10 @@ class DriveTimeline:
     unreadable: int = 0  # Commands that no receiver would take
 
     def note_state(self, state: wire.State, seen_s: float) -> None:
-        """Note a state that a policy may answer."""
         self.states.setdefault((state.session, state.episode, state.step), seen_s)
         self.flow_s.append(seen_s)
 
     def longest_gap_s(self, begin_s: float, end_s: float) -> float:
-        """Return the longest time without a command, s."""
         return longest_gap_s([c.seen_s for c in self.commands], begin_s, end_s)
 
     def stops_between(self, begin_s: float, end_s: float) -> list[str]:
@@ -241,9 +239,7 @@ class CanMonitor(can.Listener):
 
     def __init__(self, bus: str) -> None:
         self.heard: list[tuple[float, int, bytes]] = []  # Monotonic time, identifier, data
-        self.strange: list[
-            int
-        ] = []  # Identifiers that are not the Hunter's: nobody should send any
+        self.strange: list[int] = []  # Identifiers that nobody should send: not the Hunter's
         self._bus = open_bus(parse_bus(bus))
         self._notifier = can.Notifier(self._bus, [self], timeout=0.1)
 

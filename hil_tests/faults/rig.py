@@ -30,8 +30,6 @@ from edge_runtime.wire import DRIVE, SAFE_STOP, State, encode
 from hil_tests.faults import inside
 from hil_tests.faults.observe import CanMonitor, CommandSeen, DriveTimeline, Probe, Relay
 from hil_tests.processes import Process, wait_until
-from hil_tests.testing.messages import make_state
-from hil_tests.testing.policies import TASK
 
 VEHICLE_ID = "faults"
 RIDE_S = 0.5  # Of the rows with ride-through
@@ -50,9 +48,8 @@ class Rig:
     ``vehicle`` is its ``--vehicle``. The ``directory`` is an empty one, for switches and reports.
     Edge runtime and probe meet at a ``relay`` or a ``router`` where ``between`` says so. ``sender``
     sends states here, without a simulator; with ``senses`` a source stands in its place.
-    ``settings`` is TOML for the edge runtime. With the
-    vehicle ``hunter`` there is a mock of it on a CAN bus. The attributes below exist only where the
-    options ask for them.
+    ``settings`` is TOML for the edge runtime. With the vehicle ``hunter`` there is a mock of it on
+    a CAN bus. The attributes below exist only where the options ask for them.
     """
 
     simulator: Process
@@ -66,7 +63,7 @@ class Rig:
         self,
         policy: Sequence[str],
         directory: Path,
-        task: Task = TASK,
+        task: Task,
         between: str = "",
         vehicle: str = "none",
         sender: bool = False,
@@ -195,7 +192,6 @@ class Rig:
         return float(pressed[0])
 
     def stop_command(self, since_s: float) -> CommandSeen:
-        """Wait for the first safe_stop command after ``since_s``."""
         return self._command(lambda c: c.seen_s > since_s and c.mode == SAFE_STOP)
 
     def recovered_after_s(self, ended_s: float) -> float:
@@ -222,7 +218,6 @@ class Rig:
         return next(times, float("-inf"))
 
     def last_state_s(self, before_s: float) -> float:
-        """Return when the probe saw the newest state before ``before_s``."""
         return max(s for s in list(self.timeline.states.values()) if s < before_s)
 
     def edge_counts(self) -> Counter[str]:
@@ -274,7 +269,6 @@ class Sender:
         self._rig.probe.put("state", encode(state))
 
     def send_next(self, final: bool = False) -> None:
-        """Send the next step now."""
         with self.lock:
             self.step += 1
             self.send(self.state(self.step, final=final))
@@ -296,15 +290,15 @@ class Sender:
                 self.send_next()
 
 
-def noisy_state(step: int, task: Task = TASK, **changes: Any) -> State:
+def noisy_state(step: int, task: Task, **changes: Any) -> State:
     """Make a valid state of the task, which sees noise."""
     seen = inside.noise(task, np.random.default_rng(step)).items()
     fields: dict[str, Any] = {
-        "session": "campaign", "sim_time_s": round(step * task.control_period_s, 6),
-        "speed_mps": 3.0,
+        "session": "campaign", "episode": 0, "step": step, "speed_mps": 3.0, "final": False,
+        "sim_time_s": round(step * task.control_period_s, 6), "sent_ns": time.time_ns(),
         "observation": {name: value.tobytes() for name, value in seen},
     }  # fmt: skip
-    return make_state(step, **{**fields, **changes})
+    return State(**{**fields, **changes})
 
 
 class Chassis(Process):

@@ -30,7 +30,6 @@ from hil_tests.faults.inside import MOCK, SLOW, SOURCE, VEHICLE
 from hil_tests.faults.observe import REACTION_LIMIT_S, RECOVERY_LIMIT_S
 from hil_tests.faults.rig import RIDE_S, VEHICLE_ID, Rig, noisy_state
 from hil_tests.processes import wait_until
-from hil_tests.testing.policies import T
 from trainer.util import cores
 
 
@@ -53,8 +52,6 @@ class Try:
 
 @dataclass(frozen=True)
 class Row:
-    """A row of the table of faults."""
-
     name: str
     done: str
     expected: str
@@ -62,7 +59,7 @@ class Row:
     reaction_limit_s: float | None = REACTION_LIMIT_S
     recovery_limit_s: float | None = RECOVERY_LIMIT_S
     rig: Mapping[str, Any] = field(default_factory=dict)  # Options of the Rig
-    policy: str = "given"  # ``given``, or one of `run.POLICIES`.
+    policy: str = "given"  # ``given``, or one of `policies.POLICIES`.
     flows: bool = False
     """Whether the simulator's states go on through the fault: where they do not, the machine stood
     still, and the try is done again (and counted as disturbed)."""
@@ -98,7 +95,7 @@ _FEWEST_STATES = 5
 
 def at_any_phase(rig: Rig) -> None:
     """Wait a part of the control period, so that faults do not all come at the same moment."""
-    time.sleep(float(np.random.default_rng(rig.number).uniform(0, T)))
+    time.sleep(float(np.random.default_rng(rig.number).uniform(0, rig.period_s)))
 
 
 def sleep_until(time_s: float) -> None:

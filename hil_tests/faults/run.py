@@ -18,24 +18,19 @@ from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError
 from hil_tests.faults import bounds, hunter, messages, rows
 from hil_tests.faults.observe import later_s, longest_gap_s
+from hil_tests.faults.policies import POLICIES, TASK, write_policy
 from hil_tests.faults.rig import Rig
 from hil_tests.faults.rows import Row, Try, at_any_phase
 from hil_tests.processes import POLICY
-from hil_tests.testing.policies import TASK, write_policy
 
 STALLED_PERIODS = 1.5
 """States further apart than this are not the real-time drive that a row is about."""
 MOST_DISTURBED = 100
 ROWS = [*rows.ROWS, *hunter.ROWS, *messages.ROWS, *bounds.ROWS]
-POLICIES = {"steady": ("constant", 0.6), "mean": ("mean", 0.0)}
-"""Made for the rows that name them. Brightness is the pedal of `mean`: full throttle on white
-frames, the brake on all others."""
 
 
 @dataclass
 class Outcome:
-    """What all tries of a row gave."""
-
     tries: list[Try] = field(default_factory=list)
     unsafe: list[str] = field(default_factory=list)
     crashes: list[str] = field(default_factory=list)
@@ -60,9 +55,8 @@ def run_faults(
     with tempfile.TemporaryDirectory(prefix="phil-faults-") as folder:
         policies = {"given": ["--policy", str(policy), "--allow-unsigned"]}
         policies["given"] += ["--public-key", public_key] if public_key else []
-        for kind, made in POLICIES.items():
-            path = Path(folder, f"{kind}.onnx")
-            write_policy(path, *made)
+        for kind in POLICIES:
+            path = write_policy(Path(folder), kind)
             policies[kind] = ["--policy", str(path), "--allow-unsigned"]
 
         def do(row: Row) -> dict[str, Any]:

@@ -158,7 +158,6 @@ class MockHunter:
 
     @property
     def state(self) -> int:
-        """State, as 0x211 has it."""
         if "estop" in self.faults:
             return protocol.STATE_ESTOP
         is_stopped = any(BITS[error].stops for error in self.errors)
@@ -309,7 +308,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Be a Hunter until a signal comes."""
     ending, orders = threading.Event(), Orders()
     with open_bus(parse_bus(arguments.bus)) as bus:
         for number in (signal.SIGTERM, signal.SIGINT):

@@ -1,7 +1,7 @@
 """Drive and record anew what the next release is replayed against: ``make recording``.
 
-Four left turns in lock-step, and one in real time whose simulator is stopped for half a second.
-There the edge runtime must go into safe stop, and drive again after five states.
+Four left turns in lock-step, and one in real time with an outage of half a second. There the edge
+runtime must go into safe stop, and drive again after five states.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import signal
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 from edge_runtime.cli import run_cli
@@ -18,9 +17,9 @@ from edge_runtime.reach import free_endpoint
 from hil_tests.processes import POLICY, PUBLIC_KEY, Process, run_command
 
 OUT = Path(__file__).with_name("left_turn.mcap")
-TRUST = ("--policy", str(POLICY), "--public-key", str(PUBLIC_KEY))
-EPISODES = "4"
-DRIVEN_BEFORE_S, STOPPED_S = 2.0, 0.5
+TRUST = ("--policy", POLICY, "--public-key", PUBLIC_KEY)
+EPISODES = 4
+LAST = ("--seed", EPISODES, "--clock", "realtime", "--latency", "outage=0.5s@2s")
 
 
 def make_recording(_: object) -> int:
@@ -29,25 +28,17 @@ def make_recording(_: object) -> int:
     simulate = ("bridge", "simulate", "--env", "left_turn", "--listen", endpoint)
     with tempfile.TemporaryDirectory() as folder:
         made = Path(folder) / "drive.mcap"
-        record = ("bridge", "record", "--out", str(made), "--connect", endpoint)
+        record = ("record", "--out", made, "--connect", endpoint, "--linger-s", 30, "--wait-s", 30)
         first = Process(*simulate, "--episodes", EPISODES)
-        more = ("--wait-s", "30", "--linger-s", "30")
-        with first, Process(*record, *more, ready="recording") as recorder:
+        with first, Process("bridge", *record, ready="recording") as recorder:
             run = ("edge_runtime", "run", *TRUST, "--connect", endpoint)
             # It starts last, so that the drive begins once the recorder listens.
-            with Process(*run, ready="ready", shown=True) as edge:
+            with Process(*run, ready="ready", shown=True):
                 first.succeed()
-                edge.lines.clear()  # What follows is of the second one.
-                with Process(*simulate, "--seed", EPISODES, "--clock", "realtime") as second:
-                    edge.wait_for_line("now=drive")
-                    time.sleep(DRIVEN_BEFORE_S)
-                    second.send(signal.SIGSTOP)
-                    time.sleep(STOPPED_S)
-                    second.send(signal.SIGCONT)
-                    second.succeed()
+                run_command(*simulate, *LAST)
             recorder.send(signal.SIGTERM)
             recorder.succeed()
-        run_command("bridge", "replay", str(made), *TRUST)
+        run_command("bridge", "replay", made, *TRUST)
         write_atomic(OUT, made.read_bytes())
     return 0
 

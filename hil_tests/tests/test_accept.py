@@ -23,9 +23,9 @@ from hil_tests.accept import checks, command, page
 from hil_tests.accept.checks import Check, Found
 from hil_tests.envelope import UntoldError
 from hil_tests.processes import POLICY, PUBLIC_KEY
-from hil_tests.testing.commands import exit_status, refusal
-from hil_tests.testing.drives import LEFT_TURN, read
-from hil_tests.testing.policies import public_pem, write_policy
+from hil_tests.tests.shared.commands import exit_status, refusal
+from hil_tests.tests.shared.drives import LEFT_TURN, read
+from hil_tests.tests.shared.policies import public_pem, write_policy
 from trainer.util import claimed
 
 SHIPPED = ("--policy", str(POLICY), "--public-key", str(PUBLIC_KEY), "--env", "left_turn")

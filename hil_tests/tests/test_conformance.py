@@ -8,7 +8,7 @@ from edge_runtime.vehicles.mock import MockVehicle
 from hil_tests.__main__ import main
 from hil_tests.conformance import RULES
 from hil_tests.faults.rig import Chassis, free_bus
-from hil_tests.testing.commands import exit_status
+from hil_tests.tests.shared.commands import exit_status
 
 LIMITS = {
     "frozen": {**MockVehicle.limits, "steering": ActionLimit(0.5, 0.5)},

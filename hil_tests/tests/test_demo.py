@@ -1,10 +1,11 @@
 import importlib
 import json
+from unittest.mock import MagicMock
 
 import pytest
 
 from edge_runtime.cli import run_cli
-from hil_tests import demo, processes
+from hil_tests import demo
 from hil_tests.__main__ import main
 from hil_tests.processes import run_command
 
@@ -25,11 +26,10 @@ def test_the_demo_makes_all_it_promises_and_then_uses_what_is_kept(tmp_path, mon
     for name, value in SMALL.items():
         monkeypatch.setattr(demo, name, value)
 
-    def drive(*words):  # The one in real time waits for whoever records it.
-        (run_here if "lockstep" in words else run_command)(*words)
+    def run(*words):  # The one in real time waits for whoever records it.
+        (run_command if "realtime" in words else run_here)(*words)
 
-    monkeypatch.setattr(demo, "run_command", run_here)
-    monkeypatch.setattr(processes, "run_command", drive)
+    monkeypatch.setattr(demo, "run_command", run)
     words = ["demo", "--out", str(tmp_path / "demo")]
     first = main(words)
     # A policy of sixty steps may well drive badly (status 1); anything else is a fault.
@@ -50,8 +50,9 @@ def test_the_demo_makes_all_it_promises_and_then_uses_what_is_kept(tmp_path, mon
     # What the second one does with its policy is what the first one did: only its commands count.
     commands = []
     monkeypatch.setattr(demo, "run_command", lambda *words: commands.append(words[:2]))
-    monkeypatch.setattr(demo, "drive_shown", lambda *_: commands.append(("simulate",)))
+    for process in ("Process", "operator"):
+        monkeypatch.setattr(demo, process, MagicMock())
     assert main(words) == first
     assert "is kept" in capsys.readouterr().out
-    assert commands == [("trainer", "evaluate"), *[("simulate",)] * 3]
+    assert commands == [("trainer", "evaluate"), *[("bridge", "simulate")] * 3]
     assert (tmp_path / "demo" / "left_turn.onnx").read_bytes() == policy

@@ -29,7 +29,7 @@ from hil_tests.envelope import (
     find_edges,
     network,
 )  # fmt: skip
-from hil_tests.testing.commands import call, refusal
+from hil_tests.tests.shared.commands import call, refusal
 
 LIMITS = {"delay_ms": 300.0, "jitter_ms": 25.0, "tail_jitter_ms": 60.0, "loss_percent": 12.0,
           "burst_messages": 2.5, "outage_s": 0.5}  # fmt: skip

@@ -16,7 +16,7 @@ from hil_tests.faults.rows import Row, Try
 from hil_tests.faults.run import ROWS, Outcome, report_row, run_faults, use_rig
 from hil_tests.mock_hunter import FAULTS
 from hil_tests.processes import Process, wait_until
-from hil_tests.testing.policies import TASK
+from hil_tests.tests.shared.policies import TASK
 
 PLACE = ("session", 0, 7)
 ROW = Row("name", "done", "expected", lambda rig: Try())

@@ -10,7 +10,7 @@ from bridge.network import parse_spec
 from edge_runtime.cli import run_cli
 from edge_runtime.reach import free_endpoint
 from hil_tests.processes import POLICY, PUBLIC_KEY
-from hil_tests.testing.drives import LEFT_TURN, read, start_edge
+from hil_tests.tests.shared.drives import LEFT_TURN, read, start_edge
 from trainer.environments import make_environment
 from trainer.evaluation import OnnxDriver, drive_episodes
 

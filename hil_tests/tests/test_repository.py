@@ -35,7 +35,11 @@ DOORS = {"can": ROOT / "edge_runtime/vehicles/hunter/__init__.py"}
 """Where alone the edge runtime may load a library that only one kind of vehicle needs."""
 ELSEWHERE = {"ray", "av", "pyarrow", "foxglove", "stable_baselines3", "pytest", "hypothesis"}
 """Extras, and what the peers' environment has."""
-ONLY_IN = {"torch": {"trainer"}, "highway_env": {"trainer"}, "onnx": {"trainer", "bridge"}}
+ONLY_IN = {
+    "torch": {"trainer"},
+    "highway_env": {"trainer"},
+    "onnx": {"trainer", "bridge", "hil_tests"},
+}
 """Heavy libraries and the only folders that may load them."""
 RUNS = re.compile(r"allow_pickle ?= ?True|shell ?=|(?<![.\w])(__import__|compile)\(")
 """What runs what it reads and is in no rule of ruff, which has `eval`, pickle and the rest."""
@@ -49,7 +53,7 @@ OURS = re.compile(
 
 def sources(folder: str) -> list[Path]:
     """Return the folder's files without tests and their helpers, which may use all folders."""
-    others = {"tests", "testing", "build"}
+    others = {"tests", "build"}
     return [p for p in (ROOT / folder).rglob("*.py") if not others & set(p.parts)]
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from bridge.fork import FORK
+from bridge import fork
 from deploy.__main__ import main as deploy
 from deploy.bundle import build_installer
 from edge_runtime.cli import ArgumentParser
@@ -15,8 +15,8 @@ from edge_runtime.reach import free_endpoint
 from hil_tests import commands
 from hil_tests.__main__ import main
 from hil_tests.processes import POLICY, PUBLIC_KEY, wait_until
-from hil_tests.testing.commands import exit_status
-from hil_tests.testing.drives import read, start_simulate
+from hil_tests.tests.shared.commands import exit_status
+from hil_tests.tests.shared.drives import read, start_simulate
 
 ROOT = Path(__file__).parents[2]
 
@@ -75,7 +75,7 @@ def test_without_systemd_under_python38_it_installs_offline_and_drives(tmp_path)
 @pytest.mark.parametrize(
     ("command", "words"),
     [
-        (FORK, "f.mcap --at 1 --policy p.onnx --record g.mcap --out f.json"),
+        (fork, "f.mcap --at 1 --policy p.onnx --record g.mcap --out f.json"),
         (commands.campaign, "--policy p.onnx --out r.json"),
         (commands.envelope, "--policy p.onnx --out r.json"),
     ],

@@ -394,14 +394,15 @@ def draw_guidance(records: Records) -> Figure:
 
     for (above, below), task in zip(panels.T, plan.TASKS, strict=True):
         found = {row: records.of(task, Line(row, plan.GOOD)) for row in plan.ROWS}
-        learned = {row: found[row][f"human_s_to_{data.LEARNED:.0%}"] for row in plan.HELPED}
-        finite = [s for row in plan.HELPED for s in learned[row] if s < np.inf]
+        costly = (*plan.HELPED, *plan.SHOWN)
+        learned = {row: found[row][f"human_s_to_{data.LEARNED:.0%}"] for row in costly}
+        finite = [s for row in costly for s in learned[row] if s < np.inf]
         most = max(finite, default=1.0)
         never = 1.15 * most
         for row in plan.ROWS:
             success = 100.0 * found[row]["success nominal"]
             dots(below, row, success, success.mean())
-            if row in plan.HELPED:
+            if row in costly:
                 cut = learned[row].clip(upper=never)
                 dots(above, row, cut, cut.quantile(interpolation="higher"))
         above.axvline(1.08 * most, color="0.6", lw=0.8, ls=":")

@@ -1,6 +1,6 @@
 import json
 
-from hil_tests.testing.commands import call
+from hil_tests.tests.shared.commands import call
 from trainer import bench
 from trainer.scenarios import SCENARIOS
 

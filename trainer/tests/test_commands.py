@@ -8,8 +8,8 @@ import pytest
 import torch
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from hil_tests.testing.commands import call, refusal
-from hil_tests.testing.policies import public_pem
+from hil_tests.tests.shared.commands import call, refusal
+from hil_tests.tests.shared.policies import public_pem
 from trainer.tests.odd import odd
 from trainer.training.command import FINDS_NOTHING
 from trainer.training.config import RunConfig

@@ -10,7 +10,7 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from hil_tests.testing.commands import call, refusal
+from hil_tests.tests.shared.commands import call, refusal
 from trainer.training import curves
 from trainer.training.metrics import EpisodeMetrics, MetricsWriter, read_metrics
 

@@ -11,8 +11,8 @@ from bridge.__main__ import main as bridge
 from bridge.fork import read_episodes
 from bridge.tests.recordings import Hand
 from edge_runtime.util import UserError
-from hil_tests.testing.commands import refusal
-from hil_tests.testing.messages import make_feedback
+from hil_tests.tests.shared.commands import refusal
+from hil_tests.tests.shared.messages import make_feedback
 from trainer.environments import make_environment, task_of
 from trainer.learner.config import LearnerConfig
 from trainer.person.tests.people import record, recorded_step

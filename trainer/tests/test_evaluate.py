@@ -11,7 +11,7 @@ import torch
 from edge_runtime.cli import run_cli
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError
-from hil_tests.testing.commands import refusal
+from hil_tests.tests.shared.commands import refusal
 from trainer.__main__ import main
 from trainer.environments import make_environment
 from trainer.evaluation import (

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from hil_tests.testing.commands import call
+from hil_tests.tests.shared.commands import call
 from trainer.environments import expert_of, make_environment
 from trainer.evaluation import constant_driver
 from trainer.human import HumanModelConfig

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from edge_runtime.util import UserError
-from hil_tests.testing.commands import refusal
+from hil_tests.tests.shared.commands import refusal
 from trainer.training.metrics import NAMES, EpisodeMetrics, MetricsWriter, read_metrics
 
 OLDER = [name for name in NAMES if name != "validation_reward"]

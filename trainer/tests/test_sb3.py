@@ -14,7 +14,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from edge_runtime.policy import load_policy
-from hil_tests.testing.commands import call, refusal
+from hil_tests.tests.shared.commands import call, refusal
 from trainer import sb3
 
 STOP = ("--set", "action.0.stop=0")

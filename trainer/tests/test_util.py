@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from edge_runtime.util import UserError
-from hil_tests.testing.commands import refusal
+from hil_tests.tests.shared.commands import refusal
 from trainer import util
 
 

@@ -15,7 +15,7 @@ import logging
 import math
 import threading
 import time
-from typing import Any, ClassVar, Dict, List, NamedTuple, Optional, Type
+from typing import Any, ClassVar, Dict, List, Optional, Type
 
 from edge_runtime import log
 from edge_runtime.config import check_choice
@@ -241,28 +241,21 @@ _LISTEN_S, _JOIN_S = 0.1, 0.5
 _ERROR_BUS_OFF = 0x40  # of SocketCAN's error frames (linux/can/error.h)
 
 
-class BusName(NamedTuple):
-    """What python-can opens."""
-
-    interface: str
-    channel: str
-    options: Dict[str, Any]
-
-
-def parse_bus(text: str) -> BusName:
-    """Parse INTERFACE:CHANNEL, or udp_multicast:GROUP:PORT. Raises UserError."""
+def parse_bus(text: str) -> Dict[str, Any]:
+    """Parse INTERFACE:CHANNEL, or udp_multicast:GROUP:PORT, for python-can. Raises UserError."""
     interface, _, channel = text.partition(":")
     group, _, port = channel.partition(":")
     if interface == UDP and port.isdecimal():
-        # No hop: no frame leaves the machine.
-        return BusName(interface, group, {"port": int(port), "hop_limit": 0, "fd": False})
+        options = {"port": int(port), "hop_limit": 0, "fd": False}  # no frame leaves the machine
+        return {"interface": interface, "channel": group, **options}
     if interface not in ("", UDP) and channel:
         sets_bitrate = interface not in ("socketcan", "virtual")
-        return BusName(interface, channel, {"bitrate": protocol.BITRATE} if sets_bitrate else {})
+        bitrate = {"bitrate": protocol.BITRATE} if sets_bitrate else {}
+        return {"interface": interface, "channel": channel, **bitrate}
     raise UserError(f"bus {text!r} is not valid: write it as {DEFAULT_BUS} or {MULTICAST_BUS}")
 
 
-def open_bus(name: BusName) -> Any:
+def open_bus(bus: Dict[str, Any]) -> Any:
     """Open a python-can bus; send nothing. Raises UserError."""
     # Its backends say on stderr what they miss; our error says it in its one line.
     logging.getLogger("can").setLevel(logging.CRITICAL)
@@ -272,9 +265,9 @@ def open_bus(name: BusName) -> Any:
         words = "the hunter needs python-can, which is not installed: pip install python-can"
         raise UserError(words) from None
     try:
-        return can.Bus(interface=name.interface, channel=name.channel, **name.options)
+        return can.Bus(**bus)
     except Exception as error:  # each backend raises what its library raises, NameError included
-        words = f"the CAN bus {name.interface}:{name.channel} cannot be opened: {error!r}"
+        words = f"the CAN bus {bus['interface']}:{bus['channel']} cannot be opened: {error!r}"
         raise UserError(f"{words}; is it up, with a route (`ip link`, `ip route`)?") from None
 
 
@@ -302,7 +295,7 @@ class HunterVehicle(streamed.StreamedVehicle):
         bus = parse_bus(settings.bus)
         self._bus: Any = open_bus(bus)
         # Our own frames come back there: a command need not be somebody else's.
-        self._ignores_commands = bus.interface == UDP
+        self._ignores_commands = bus["interface"] == UDP
         self._core: HunterCore
         super().__init__(HunterCore(similarity, settings.profile))
         self._listener = threading.Thread(target=self._listen, name="hunter-listener", daemon=True)

@@ -118,10 +118,7 @@ MOTOR_OF_SLOW = {frame.can_id: motor for frame, motor in zip(MOTORS_SLOW, _MOTOR
 
 
 def encode(frame: Frame, message: Any) -> bytes:
-    """Return the data of a message: rounded to counts, and clamped to what each field can hold.
-
-    Raises ValueError for a number that is not finite: no count stands for it.
-    """
+    """Return a message's data, clamped to what each field can hold; ValueError if not finite."""
     counts = []
     numbers = filter("bBhHi".__contains__, frame.layout)  # The others are space between them.
     for code, worth, value in zip(numbers, frame.worth, message):

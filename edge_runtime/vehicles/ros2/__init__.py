@@ -24,15 +24,10 @@ from edge_runtime import log
 from edge_runtime.config import check_choice
 from edge_runtime.transport import check_endpoint, is_tls, only_own, open_session
 from edge_runtime.util import UserError
+from edge_runtime.vehicles import streamed
 from edge_runtime.vehicles.mapping import RobotSettings, Similarity
 from edge_runtime.vehicles.plausibility import Fault, Finding, impossible
-from edge_runtime.vehicles.streamed import (
-    Speeds,
-    StreamedCore,
-    StreamedVehicle,
-    VehicleEvent,
-    VehicleState,
-)
+from edge_runtime.vehicles.streamed import VehicleEvent, VehicleState
 
 # Beside our own 7447, where a bridge listens by default, too; and of this machine only.
 DEFAULT_ROS2_ENDPOINT = "tcp/127.0.0.1:7448"
@@ -45,10 +40,7 @@ STEERS_FROM_MPS = 0.2
 
 
 def topic_key(namespace: str, topic: str) -> str:
-    """Return the Zenoh key of a topic: below the namespace unless it begins with a slash.
-
-    Raises UserError for names that ROS would not take.
-    """
+    """Return a topic's Zenoh key: below the namespace unless it begins with a slash."""
     for name in (topic, *([] if namespace == "/" else [namespace])):
         if not _NAME.fullmatch(name):
             raise UserError(f"ROS name {name!r} is not valid: write it like /hunter01/odom")
@@ -125,12 +117,10 @@ def twist_of(motion: Motion, angular: str, wheelbase_m: float) -> bytes:
 def topic_token(member: str, role: str, key: str, kind: str) -> str:
     """Return the token of a member's PUBLISHER or SUBSCRIBER, as zenoh-bridge-ros2dds has it.
 
-    It makes every bridge (1.1 or later) create the reader or writer on its DDS side; without it a
-    bridge would carry only what a ROS node beside it already wants. Its last part is
-    `<keyed>:<reliable>:<transient local>:<history>,<depth>:<user data>` in DDS's numbers. We
+    It makes every bridge (1.1 or later) create the reader or writer on its DDS side. Its last part
+    is `<keyed>:<reliable>:<transient local>:<history>,<depth>:<user data>` in DDS's numbers. We
     publish reliably, because a reader of either kind matches, and subscribe best effort: a reliable
-    reader would never hear a best-effort writer, as sensors are. No key, no old messages for late
-    readers, and the last ten kept.
+    reader would never hear a best-effort writer, as sensors are.
     """
     names = (name.replace("/", _SLASH) for name in (key, kind))
     qos = f":{int(role == PUBLISHER)}:0:0,10:typehash=RIHS01_{TYPES[kind]};"
@@ -164,9 +154,9 @@ class Ros2Settings(RobotSettings, frozen=True, kw_only=True):
             raise UserError(f"ros2 has one topic for both, {self.twist_topic}: give two")
 
 
-class Ros2Core(StreamedCore):
+class Ros2Core(streamed.StreamedCore):
     def __init__(self, settings: Ros2Settings, similarity: Similarity) -> None:
-        super().__init__(similarity, Speeds())
+        super().__init__(similarity, streamed.Speeds())
         self._stamp_ns = 0  # of the newest, by its sender's clock
         self._angular: Optional[float] = None  # of the newest, as the settings say
         self._newest_s = -math.inf
@@ -183,10 +173,7 @@ class Ros2Core(StreamedCore):
         self._apply(Finding(VehicleEvent.CLOSE), now_s)
 
     def hear(self, stamp_ns: int, speed_mps: float, angular: float, now_s: float) -> None:
-        """Take finite odometry; it counts where it is newer than the last by its own stamp.
-
-        A sender that leaves its stamps at 0 is believed by the time of arrival alone.
-        """
+        """Take finite odometry; one counts that is newer by its own stamp, or has none (0)."""
         # While nothing is driven, a clock set back is believed; a repetition is not.
         is_older = stamp_ns < self._stamp_ns and self._has_asked
         if stamp_ns > 0 and (is_older or stamp_ns == self._stamp_ns):
@@ -198,7 +185,6 @@ class Ros2Core(StreamedCore):
         self._apply(lie or Finding(VehicleEvent.CONFIRMED), now_s)
 
     def tick(self, now_s: float) -> Optional[Motion]:
-        """Return what to publish now; None while DISABLED."""
         self._look(now_s)
         if self.state is VehicleState.DISABLED:
             return None
@@ -225,11 +211,8 @@ class Ros2Core(StreamedCore):
         return math.atan(self._spec.wheelbase_m * angular / speed_mps)
 
 
-class Ros2Vehicle(StreamedVehicle):
-    """Opens its session and announces its topics when made; publishes nothing before `enable`.
-
-    Raises UserError, when made, for settings that are not valid and for a busy port.
-    """
+class Ros2Vehicle(streamed.StreamedVehicle):
+    """Opens its session and announces its topics when made; publishes nothing before `enable`."""
 
     name: ClassVar[str] = "ros2"
     settings_type: ClassVar[Type[RobotSettings]] = Ros2Settings

@@ -7,7 +7,7 @@ from contextlib import closing
 
 import pytest
 
-from hil_tests.testing.commands import call
+from hil_tests.tests.shared.commands import call
 from trainer.environments import make_environment
 from trainer.person import web
 from trainer.person.tests.browser import READY, find_chromium, first_view, open_browser, until

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from bridge.outcomes import STOPPED
-from hil_tests.testing.commands import call, refusal
+from hil_tests.tests.shared.commands import call, refusal
 from trainer.evaluation import BEST_FILE, CHECKPOINT_FILE
 from trainer.person import Reading
 from trainer.person.recording import find_recordings, read_steps

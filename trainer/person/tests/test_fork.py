@@ -4,10 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from bridge.fork import RecordedEpisode, read_episode
+from bridge import fork
+from bridge.fork import RecordedEpisode
 from bridge.tests.recordings import record_in_process
-from hil_tests.testing.commands import call
-from hil_tests.testing.policies import write_policy
+from hil_tests.tests.shared.commands import call
+from hil_tests.tests.shared.policies import write_policy
 from trainer.person.recording import find_recordings, read_episodes, read_steps
 from trainer.person.tests.people import LET_GO, QUIT, Puppet, hold
 
@@ -22,7 +23,8 @@ def recorded(tmp_path, monkeypatch, one_thread) -> RecordedEpisode:
     write_policy("policy.onnx", "constant", 0.2)
     drive = Path("drive.mcap")
     record_in_process(drive, "left_turn", Path("policy.onnx"), 3, "50ms", "variant")
-    return read_episode(drive, None, None)
+    (episode,) = fork.read_episodes(drive)
+    return episode
 
 
 def test_a_persons_fork_begins_where_the_drive_was_and_is_a_demonstration(

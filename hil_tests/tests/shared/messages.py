@@ -6,7 +6,7 @@ import time
 from typing import Any
 
 from edge_runtime.wire import Command, Feedback, Health, State
-from hil_tests.testing.policies import SIZE
+from hil_tests.tests.shared.policies import SIZE
 
 BLACK, WHITE = 0, 255
 

@@ -72,5 +72,5 @@ VARIANTS: dict[str, dict[str, float]] = {
 }
 for name, options in VARIANTS.items():
     if name not in gymnasium.registry:
-        made: Any = {"entry_point": "hil_tests.testing.environments:ToyEnv", "kwargs": options}
+        made: Any = {"entry_point": "hil_tests.tests.shared.environments:ToyEnv", "kwargs": options}
         gymnasium.register(name, **made, disable_env_checker=True, order_enforce=False)

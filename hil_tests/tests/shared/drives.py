@@ -19,13 +19,13 @@ from edge_runtime.link import ask
 from edge_runtime.transport import open_session
 from edge_runtime.wire import Command, Feedback, Health, State
 from hil_tests.processes import PATIENCE_S, Process, wait_until
-from hil_tests.testing.messages import make_state
-from hil_tests.testing.policies import T, write_policy
+from hil_tests.tests.shared.messages import make_state
+from hil_tests.tests.shared.policies import T, write_policy
 
 TOY, SLOW_TOY = (
-    f"hil_tests.testing.environments:{name}-v0" for name in ("BridgeToy", "BridgeToySlow")
+    f"hil_tests.tests.shared.environments:{name}-v0" for name in ("BridgeToy", "BridgeToySlow")
 )
-LEFT_TURN = Path(__file__).parents[1] / "recordings" / "left_turn.mcap"
+LEFT_TURN = Path(__file__).parents[2] / "recordings" / "left_turn.mcap"
 
 
 def make_policy(folder: Path, kind: str = "mean", value: float = 0.3) -> Path:
