@@ -11,7 +11,7 @@ import pytest
 from deploy.__main__ import main as deploy
 from edge_runtime.reach import free_endpoint
 from hil_tests.processes import Process, wait_until
-from hil_tests.testing.drives import TOY, make_policy
+from hil_tests.tests.shared.drives import TOY, make_policy
 
 PYTHON_FIRST = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
 
