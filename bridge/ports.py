@@ -144,11 +144,8 @@ def open_port(
     router it is the router that sees to that.
     UserError if the port is busy, or if no router answers within ``wait_s``.
     """
-    rules = None
-    if tls is not None:
-        able = (access.ROUTER,) if connect is None else ()
-        access.check_name(tls.name, access.common_name(access.SIMULATOR, vehicle_id), *able)
-        rules = access.rules_for_listener([vehicle_id])
+    listens = connect is None
+    rules = None if tls is None else access.rules_for_simulator(tls, vehicle_id, listens)
     # Behind a router a client: two peers there would not hear one another.
     if connect is not None:
         session = connect_client(connect, wait_s, tls)

@@ -40,9 +40,18 @@ REMOTE, ESTOP, SILENCE, TURNS = "remote_control", "emergency_stop", "silence", "
 EXAMPLE = examples("python -m edge_runtime jog --config edge.toml --out jog.json")
 Condition = Callable[[Any], Any]  # of a report
 Ask = Callable[[str, str], None]
-faults: Condition = lambda it: it.faults  # noqa: E731
-nothing: Condition = lambda it: False  # noqa: E731
-stands: Condition = lambda it: abs(it.speed_mps) <= STANDS_MPS  # noqa: E731
+
+
+def faults(report: Any) -> Any:
+    return report.faults
+
+
+def nothing(report: Any) -> bool:
+    return False
+
+
+def stands(report: Any) -> bool:
+    return abs(report.speed_mps) <= STANDS_MPS
 
 
 def bench_manifest(task: str, period_s: float) -> Manifest:

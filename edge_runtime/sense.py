@@ -280,11 +280,8 @@ def _open(
     asked: argparse.Namespace, vehicle_id: str, task: Task, tls: Optional[access.TlsFiles]
 ) -> Iterator[_End]:
     """Connect, or listen, as a simulator does. Raises UserError."""
-    rules = None
-    if tls is not None:
-        able = (access.ROUTER,) if asked.connect is None else ()
-        access.check_name(tls.name, access.common_name(access.SIMULATOR, vehicle_id), *able)
-        rules = access.rules_for_listener([vehicle_id])
+    listens = asked.connect is None
+    rules = None if tls is None else access.rules_for_simulator(tls, vehicle_id, listens)
     if asked.connect is not None:
         session = open_session(connect=asked.connect, mode="client", tls=tls)
     else:

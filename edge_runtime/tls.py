@@ -176,6 +176,16 @@ def check_name(name: str, *able: str) -> None:
         raise UserError(f"--tls names the certificate of {name}; {right}")
 
 
+def rules_for_simulator(tls: TlsFiles, vehicle_id: str, listens: bool) -> Dict[str, Any]:
+    """Make the rules of a simulator's end that listens; UserError for another party's certificate.
+
+    One that listens may have the router's: it is one.
+    """
+    able = (ROUTER,) if listens else ()
+    check_name(tls.name, common_name(SIMULATOR, vehicle_id), *able)
+    return rules_for_listener([vehicle_id])
+
+
 def rules_for_listener(vehicle_ids: Sequence[str]) -> Dict[str, Any]:
     """Make a listener's `access_control`: the rights of each party of these vehicles, no more."""
     parties = {
