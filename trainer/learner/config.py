@@ -42,7 +42,6 @@ class Algorithm:
     proxy_values: bool = False
     """The critics learn the values 1 for the human's action and -1 for the overruled one."""
     human_share: float = 0.0  # Of each minibatch; 0: as the priorities have it
-    updates_per_step: int = 1
     asks: float = 0.0
     """Share of the steps, those in which its critics disagree most, in which the robot asks for
     help; 0: the human watches, and takes over without being asked."""
@@ -111,8 +110,7 @@ ALGORITHMS: dict[str, Algorithm] = {
     # Without failures of its own the critics rate every action good.
     "rlpd_td3": Algorithm(
         penalty=False, behaviour_cloning=False, advantage_weight=0.0, human_share=0.5,
-        updates_per_step=2,
-        settings={**UNIFORM, **FASTER, "policy_delay": 2},
+        settings={**UNIFORM, **FASTER, "policy_delay": 2, "updates_per_step": 2},
     ),
     # Predictive preference learning (2510.01545): in the L = 4 states to which the overruled action
     # would have led, the human's is preferred. Cloning counts as much. No Q term.
@@ -185,6 +183,8 @@ class LearnerConfig:
     carry them back."""
     tau: float = 5e-3
     """Share of the online weights that each soft update moves into the targets (table A5: 1e-3)."""
+    updates_per_step: int = 1
+    """Updates for each environment step (algorithm 1)."""
     policy_delay: int = 1
     """Critic updates for each actor update (table A5: d)."""
     target_noise: float = 0.2
@@ -295,7 +295,7 @@ class LearnerConfig:
 OVERRULED_ACTION, HUMANS_ACTION = "overruled", "human"
 WORDS = {"precision": ("float32", "bfloat16"), "penalty_on": (OVERRULED_ACTION, HUMANS_ACTION)}
 RANGES = {
-    FROM_ONE: ("return_steps", "policy_delay", "warmup_steps"),
+    FROM_ONE: ("return_steps", "policy_delay", "updates_per_step", "warmup_steps"),
     SHARE: ("learning_rate_decay", "learning_rate_final", "gamma", "tau",
             "exploration_correlation", "alpha", "beta", "cloning_share"),
     ABOVE_ZERO: ("exploration_share", "priority_offset"),
