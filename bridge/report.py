@@ -7,6 +7,7 @@ rest is for ``bridge simulate``. `ProgressBar` shows how far any command is.
 from __future__ import annotations
 
 import io
+import math
 import sys
 import time
 from collections import Counter
@@ -227,6 +228,7 @@ class ProgressBar:
             *(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()),
             TextColumn("{task.fields[figures]}", markup=False),
             *(TextColumn("ETA"), TimeRemainingColumn()),
+            speed_estimate_period=math.inf,  # A piece may take hours.
             console=Console(stderr=True),
             disable=not sys.stderr.isatty(),
         )
@@ -246,5 +248,6 @@ class ProgressBar:
         now_s = time.monotonic()
         is_due = now_s - self._line_s > LINE_INTERVAL_S or self.done >= self.total
         if self._bar.disable and is_due:
-            self._line_s = now_s
-            print(f"{self.what}: {self.done}/{self.total}  {text}", file=sys.stderr)
+            self._line_s, left_s = now_s, self._bar.tasks[self._task].time_remaining
+            left = "" if left_s is None else f"{left_s / 60.0:.0f} min left  "
+            print(f"{self.what}: {self.done}/{self.total}  {left}{text}", file=sys.stderr)

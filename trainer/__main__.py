@@ -188,6 +188,7 @@ def export(parser: argparse.ArgumentParser) -> None:
 def bench(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="R.json", help="also write the figures to this file")
     add_threads(parser)
+    add_device(parser)
 
 
 @command(

@@ -1,4 +1,7 @@
-"""Measure the learner, the environments and a training on this machine."""
+"""Measure the learner, the environments and a training on this machine.
+
+On a GPU also Stable-Baselines3's TD3, in turn with ours, so that other work hits both alike.
+"""
 
 import argparse
 import contextlib
@@ -7,22 +10,25 @@ import os
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import torch
 
 from bridge.report import ProgressBar
 from edge_runtime.files import check_writable, write_json_out
 from trainer.environments import make_environment
+from trainer.learner import networks
 from trainer.learner.config import LearnerConfig
 from trainer.scenarios import SCENARIOS
 from trainer.training.config import RunConfig
 from trainer.training.learning import LearningThread
 from trainer.training.run import TrainingRun
-from trainer.util import processor_model, set_threads, source_revision
+from trainer.util import check_device, processor_model, set_threads, source_revision
 
 ROUNDS = 20
 UPDATES, STEPS = 5, 200  # In a round; so many steps are about three episodes
@@ -31,26 +37,29 @@ PARTS = ("environment", "acting", "storing", "learning", "waiting")
 
 def run(arguments: argparse.Namespace) -> int:
     check_writable(arguments.out)
+    check_device(arguments.device)
     set_threads(arguments.threads)
-    report = measure()
+    report = measure(arguments.device)
     write_json_out(arguments.out, report)
     print(json.dumps(report, indent=2))
     return 0
 
 
-def measure(batch_size: int = LearnerConfig.batch_size) -> dict[str, Any]:
-    """Return the report: machine and versions, and the contract's three figures."""
+def measure(device: str = "cpu", batch_size: int = LearnerConfig.batch_size) -> dict[str, Any]:
+    """Return the report: machine and versions, the contract's three figures, and a GPU's own."""
     learner = LearnerConfig(batch_size=batch_size, warmup_steps=batch_size)
+    config = RunConfig(evaluate_every_steps=0, learner=learner, device=device)
     with (
         ProgressBar("bench", 2 + len(SCENARIOS)) as bar,
         tempfile.TemporaryDirectory() as directory,
     ):
-        run = TrainingRun(RunConfig(evaluate_every_steps=0, learner=learner), Path(directory))
+        run = TrainingRun(config, Path(directory))
         with contextlib.closing(run.learning):
             training = measure_training(run)
             bar.advance({})
             update_s = run.learning.in_thread(median_s, whole_update(run.learning), UPDATES)
             bar.advance({"update": f"{1e3 * update_s:.1f} ms"})
+            on_gpu = {} if device == "cpu" else on_a_gpu(run)
         step_s = {}
         for name in SCENARIOS:
             step_s[name] = median_s(steps_of(name), STEPS)
@@ -61,21 +70,35 @@ def measure(batch_size: int = LearnerConfig.batch_size) -> dict[str, Any]:
         "torch": torch.__version__,
         "source_revision": source_revision(),
         "batch_size": batch_size,
+        "on_gpu": on_gpu,
         "learner_ms_per_update": 1e3 * update_s,
         "environment_steps_per_s": {name: 1.0 / value for name, value in step_s.items()},
         "train_s_per_10k_steps": training,
     }
 
 
-def median_s(work: Callable[[], object], pieces: int) -> float:
-    """Return the median over rounds of a piece's seconds; one more round is not counted."""
-    times = []
+def in_turn(contenders: dict[str, Callable[[], int]]) -> dict[str, float]:
+    """Return the median over rounds of each contender's seconds; one more round is not counted.
+
+    Its seconds for a piece: a contender returns how many it has done.
+    """
+    times: dict[str, list[float]] = {name: [] for name in contenders}
     for _ in range(1 + ROUNDS):
-        began_s = time.perf_counter()
-        for _ in range(pieces):
-            work()
-        times.append((time.perf_counter() - began_s) / pieces)
-    return float(np.median(times[1:]))
+        for name, work in contenders.items():
+            began_s = time.perf_counter()
+            pieces = work()
+            times[name].append((time.perf_counter() - began_s) / pieces)
+    return {name: float(np.median(each[1:])) for name, each in times.items()}
+
+
+def repeated(work: Callable[[], object], pieces: int) -> int:
+    for _ in range(pieces):
+        work()
+    return pieces
+
+
+def median_s(work: Callable[[], object], pieces: int) -> float:
+    return in_turn({"": partial(repeated, work, pieces)})[""]
 
 
 def whole_update(learning: LearningThread) -> Callable[[], None]:
@@ -116,3 +139,56 @@ def measure_training(run: TrainingRun) -> dict[str, float]:
     seconds |= {name: sum(getattr(each, f"{name}_s") for each in driven) for name in PARTS}
     steps = sum(each.steps for each in driven)
     return {name: 1e4 / steps * value for name, value in seconds.items()}
+
+
+def on_a_gpu(run: TrainingRun) -> dict[str, Any]:
+    """Measure an update and a training step, ours and Stable-Baselines3's, and a replay alone, ms.
+
+    Theirs has the networks of tables A2 and A3 and does less: the critics share one trunk, replay
+    is uniform, and there is neither Q advantage nor cloning.
+    """
+    model, (recorded,) = stable_baselines3(run.config), run.learning.learner.recorded.values()
+
+    def replay() -> None:
+        recorded.replay()
+        torch.cuda.synchronize()
+
+    def drive(steps: int = 10 * UPDATES) -> int:
+        model.learn(steps, reset_num_timesteps=False)
+        return steps
+
+    ours, theirs = (
+        whole_update(run.learning),
+        partial(model.train, 1, run.config.learner.batch_size),
+    )
+    median_s = in_turn({
+        "replay": partial(repeated, replay, UPDATES),
+        "update": partial(run.learning.in_thread, repeated, ours, UPDATES),
+        "update_of_stable_baselines3": partial(repeated, theirs, UPDATES),
+        "step": lambda: run.advance().steps,
+        "step_of_stable_baselines3": drive,
+    })  # fmt: skip
+    return {"gpu": torch.cuda.get_device_name(),
+            **{f"ms_per_{name}": 1e3 * piece_s for name, piece_s in median_s.items()}}  # fmt: skip
+
+
+def stable_baselines3(config: RunConfig) -> Any:
+    """Make Stable-Baselines3's TD3, beyond its warm-up."""
+    from stable_baselines3 import TD3
+    from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+
+    class Trunk(BaseFeaturesExtractor):
+        def __init__(self, space: gymnasium.Space[Any]) -> None:
+            super().__init__(space, networks.FEATURES)
+            self.trunk = networks.make_trunk(networks.FRAMES_SPACE, 2)
+
+        def forward(self, images: torch.Tensor) -> torch.Tensor:
+            return self.trunk(images)
+
+    batch_size = config.learner.batch_size
+    model = TD3(
+        "CnnPolicy", gymnasium.make(SCENARIOS["left_turn"]), learning_starts=batch_size,
+        batch_size=batch_size, buffer_size=10_000, policy_delay=1, device=config.device,
+        policy_kwargs={"features_extractor_class": Trunk, "net_arch": [*networks.HIDDEN]},
+    )  # fmt: skip
+    return model.learn(2 * batch_size)

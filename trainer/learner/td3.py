@@ -6,7 +6,6 @@ written plainly.
 
 import copy
 from collections.abc import Iterable
-from dataclasses import replace
 from functools import partial
 from itertools import chain, islice
 from typing import Any, NamedTuple
@@ -14,13 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from gymnasium.spaces import Box, Space
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from torch import Tensor
 
 from trainer.learner import equations, networks
 from trainer.learner.config import OVERRULED_ACTION, Algorithm, LearnerConfig
 from trainer.learner.networks import FRAMES_SPACE, Actor, CriticPair, tensors
+from trainer.learner.recorded import RecordedStep
 from trainer.learner.replay import Batch
 
 
@@ -32,6 +31,40 @@ class Losses(NamedTuple):
     cloning_loss: float
     value: float  # Mean Q_1 of the batch
     priorities: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, figures: Tensor) -> "Losses":
+        """Wait for what ``TD3Learner.begin`` gave."""
+        found = figures.double().cpu().numpy()
+        critic, policy, cloning, value = map(float, found[:4])
+        return cls(critic, policy, cloning, value, found[4:])
+
+
+class Choices(NamedTuple):
+    """Observations, the human's action in each, and the overruled one."""
+
+    seen: list[Tensor]
+    actions: Tensor
+    overruled: Tensor
+
+
+class Tensors(NamedTuple):
+    """What a step needs of a ``Batch`` of ``n``, each [n, ...]."""
+
+    seen: list[Tensor]
+    actions: Tensor
+    rewards: Tensor
+    next_seen: list[Tensor]
+    discount: Tensor  # gamma ^ spans
+    terminals: Tensor
+    human: Tensor
+    importance: Tensor  # The weights of eq. 15
+    looked_at: Tensor  # Rows whose Q advantage is wanted
+    overruled: Tensor | None
+    penalised: Tensor
+    cloning_weight: Tensor  # Of this update, []
+    shown: Choices | None
+    foreseen: Choices | None
 
 
 def charges_overruled(config: LearnerConfig, algorithm: Algorithm) -> bool:
@@ -79,20 +112,13 @@ class TD3Learner:
             self.critics = critics.to(self.device)
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
-        self.actor_optimiser = torch.optim.Adam(
-            self.actor.parameters(), config.actor_learning_rate, fused=True
-        )
-        self.critic_optimiser = torch.optim.Adam(
-            self.critics.parameters(), config.critic_learning_rate, fused=True
-        )
-        self.cloning_optimiser = torch.optim.Adam(
-            self.actor.parameters(), config.cloning_learning_rate, fused=True
-        )
-        for optimiser in (getattr(self, name) for name in OPTIMISERS):
-            for group in optimiser.param_groups:
-                group["decayed_lr"] = group["lr"]
+        self.actor_optimiser = self._adam(self.actor, config.actor_learning_rate)
+        self.critic_optimiser = self._adam(self.critics, config.critic_learning_rate)
+        self.cloning_optimiser = self._adam(self.actor, config.cloning_learning_rate)
         self.noise = torch.Generator(self.device).manual_seed(seed)
         self.updates = 0
+        self.recorded: dict[tuple[bool, ...], RecordedStep] = {}
+        """Kind of step -> what a GPU replays; forgotten where optimisers get new tensors."""
         self._fade = 1.0  # Of the weight on cloning
         # bfloat16 has 8 bits of precision: enough for pixels, too few for numbers.
         self._reduces = isinstance(space, Box) and networks.is_picture(space.dtype, space.shape)
@@ -119,43 +145,90 @@ class TD3Learner:
 
     def update(self, batch: Batch, beta: float = 0.0) -> Losses:
         """Take one step of algorithm 1 on a minibatch; ``beta`` is eq. 15's exponent."""
-        c = self.config
+        return Losses.of(self.begin(batch, beta))
+
+    def begin(self, batch: Batch, beta: float = 0.0) -> Tensor:
+        """Begin that step; on a GPU it goes on by itself until ``Losses.of`` waits for it."""
         self.updates += 1
-        with_policy = self.updates % c.policy_delay == 0
-        batch = replace(
-            batch, frames=self._shift(batch.frames), next_frames=self._shift(batch.next_frames)
+        with_policy = self.updates % self.config.policy_delay == 0
+        prepared = self._prepare(batch, beta)
+        if not self._on_gpu:
+            return self._step(prepared, with_policy)
+        kind = with_policy, prepared.shown is not None, prepared.foreseen is not None
+        if kind not in self.recorded:
+            step = partial(self._step, with_policy=with_policy)
+            self.recorded[kind] = RecordedStep(step, self.noise)
+        return self.recorded[kind](prepared)
+
+    def _prepare(self, batch: Batch, beta: float) -> Tensors:
+        """Turn a batch into tensors, in the processor's memory.
+
+        A processor leaves out what has no effect. A GPU's step is recorded, so it has one shape.
+        """
+        c, column, everything = self.config, torch.from_numpy, self._on_gpu
+        charged = self._charges_overruled and (everything or batch.penalised.any())
+        valued = self.algorithm.proxy_values and (everything or batch.human.any())
+        judged = np.arange(len(batch.human)) if everything else np.flatnonzero(batch.human)
+        probabilities = column(batch.probabilities).float()
+        shown, foreseen = batch.shown, batch.foreseen if self.algorithm.foresight else None
+
+        def choices(frames: NDArray[Any], batch: Batch) -> Choices:
+            return Choices(tensors(frames), column(batch.actions), column(batch.overruled))
+
+        return Tensors(
+            seen=tensors(batch.frames),
+            actions=column(batch.actions),
+            rewards=column(batch.rewards),
+            next_seen=tensors(batch.next_frames),
+            discount=c.gamma ** column(batch.spans),
+            terminals=column(batch.terminals),
+            human=column(batch.human),
+            importance=equations.importance_weights(probabilities, beta, c.normalise_importance),
+            looked_at=column(judged),
+            overruled=column(batch.overruled) if charged or valued else None,
+            penalised=column(batch.penalised),
+            cloning_weight=torch.tensor(self._fade * c.cloning_weight),
+            shown=None if shown is None else choices(shown.frames, shown),
+            foreseen=None if foreseen is None else choices(foreseen.next_frames, foreseen),
         )
-        seen, actions = tensors(batch.frames, self.device), self._tensor(batch.actions)
-        human = self._tensor(batch.human)
+
+    def _step(self, batch: Tensors, with_policy: bool) -> Tensor:
+        """Take a step; return the four losses and the batch's new priorities, [4 + n].
+
+        Branches on nothing that a tensor holds.
+        """
+        batch = batch._replace(
+            seen=self._shifted(batch.seen), next_seen=self._shifted(batch.next_seen)
+        )
         targets = self._targets(batch)
         with self._precision():
-            pictures = [critic.picture(*seen) for critic in self.critics.pair]
-            own_picture = self.actor.picture(*seen)
-        critic_loss, errors, value = self._critic_loss(batch, pictures, actions, targets, beta)
+            pictures = [critic.picture(*batch.seen) for critic in self.critics.pair]
+            own_picture = self.actor.picture(*batch.seen)
+        critic_loss, errors, value = self._critic_loss(batch, pictures, targets)
         score = self.actor.head(own_picture)
         own_actions = torch.tanh(score)
-        judged = self._judge(seen, actions, human, own_actions.detach())
-        policy = self._policy_loss(pictures[0].detach(), own_actions, human)
-        cloning = self._cloning_loss(batch.shown, own_actions, actions, human, judged)
-        priorities = self._priorities(errors, judged, human)
-        if self.algorithm.foresight and batch.foreseen is not None:
+        judged = self._judge(batch.seen, batch.actions, batch.looked_at, own_actions.detach())
+        policy = self._policy_loss(pictures[0].detach(), own_actions, batch.human)
+        cloning = self._cloning_loss(batch, own_actions, judged)
+        priorities = self._priorities(errors, judged, batch.human)
+        if batch.foreseen is not None:
             policy = policy + self._preference_loss(batch.foreseen)
 
         _differentiate(critic_loss, self.critics)
         if with_policy:
-            self._step_actor(policy, cloning, score, apart=batch.shown is not None)
+            self._step_actor(batch, policy, cloning, score)
         self.critic_optimiser.step()
         if with_policy:
             self._update_targets()
-        critics, actor, clone, mean = (one.item() for one in (critic_loss, policy, cloning, value))
-        return Losses(critics, actor, clone, mean, priorities.double().cpu().numpy())
+        losses = torch.stack([critic_loss, policy, cloning, value]).detach()
+        return torch.cat([losses, priorities])
 
-    def _step_actor(self, policy: Tensor, cloning: Tensor, score: Tensor, apart: bool) -> None:
-        """Step by both terms of eq. 23; ``apart``: by an optimiser each."""
+    def _step_actor(self, batch: Tensors, policy: Tensor, cloning: Tensor, score: Tensor) -> None:
+        """Step by both terms of eq. 23; where imitation has a batch, by an optimiser each."""
         c, row = self.config, self.algorithm
         saturation = c.saturation_weight * score.square().mean() if c.saturation_weight else 0.0
-        if not apart:
-            loss = policy + self._fade * c.cloning_weight * cloning + saturation
+        if batch.shown is None:
+            loss = policy + batch.cloning_weight * cloning + saturation
             _differentiate(loss, self.actor)
             self.actor_optimiser.step()
             return
@@ -181,7 +254,8 @@ class TD3Learner:
         optimiser = torch.optim.Adam(fresh.parameters(), c.cloning_learning_rate, fused=True)
         for done, batch in enumerate(islice(batches, most)):
             optimiser.param_groups[0]["lr"] = c.cloning_learning_rate * (1 - done / most)
-            seen, human = tensors(self._shift(batch.frames), self.device), self._tensor(batch.human)
+            seen = self._shifted(tensors(batch.frames, self.device))
+            human = self._tensor(batch.human)
             loss = equations.behaviour_cloning_loss(
                 fresh(*seen), self._tensor(batch.actions), human, None, c.cloning_bound
             )
@@ -191,6 +265,7 @@ class TD3Learner:
             actor.load_state_dict(fresh.state_dict())
         self.actor_optimiser.state.clear()
         self.cloning_optimiser.state.clear()
+        self.recorded.clear()
 
     def decay(self, progress: float) -> None:
         """Decay both rates (table A5) and the weight on cloning after an episode.
@@ -201,12 +276,15 @@ class TD3Learner:
         if c.cloning_share:
             self._fade = max(0.0, 1.0 - progress / c.cloning_share)
         left = 1.0 - (1.0 - c.learning_rate_final) * min(progress, 1.0)
-        for optimiser in (getattr(self, name) for name in OPTIMISERS):
-            for group in optimiser.param_groups:
+        for name in OPTIMISERS:
+            fade = self._fade if name == "cloning_optimiser" else 1.0
+            for group in getattr(self, name).param_groups:
                 group["decayed_lr"] *= c.learning_rate_decay
-                group["lr"] = group["decayed_lr"] * left
-        for group in self.cloning_optimiser.param_groups:
-            group["lr"] *= self._fade
+                rate = group["decayed_lr"] * left * fade
+                if self._on_gpu:
+                    group["lr"].fill_(rate)
+                else:
+                    group["lr"] = rate
 
     def state_dict(self) -> dict[str, Any]:
         """Return weights, optimisers, noise and counters: all that a resumed run needs."""
@@ -223,89 +301,107 @@ class TD3Learner:
             if not kept["exp_avg"].shape == kept["exp_avg_sq"].shape == weights.shape:
                 # torch does not check.
                 raise ValueError("an optimiser's state is of other weights")
+        for group in chain(*(getattr(self, name).param_groups for name in OPTIMISERS)):
+            group |= {"lr": self._rate(float(group["lr"])), "capturable": self._on_gpu}
+        self.recorded.clear()
         self.noise.set_state(state["noise"])
         self.updates, self._fade = state["updates"], state["fade"]
+
+    def _adam(self, network: torch.nn.Module, rate: float) -> torch.optim.Adam:
+        made = torch.optim.Adam(
+            network.parameters(), self._rate(rate), fused=True, capturable=self._on_gpu
+        )
+        for group in made.param_groups:
+            group["decayed_lr"] = rate
+        return made
+
+    def _rate(self, rate: float) -> float | Tensor:
+        """Return a learning rate as Adam keeps it; a recorded step reads it from a tensor."""
+        return torch.tensor(rate, device=self.device) if self._on_gpu else rate
+
+    @property
+    def _on_gpu(self) -> bool:
+        return self.device.type == "cuda"
 
     def _precision(self) -> torch.autocast:
         kind = self.device.type
         reduced = self.config.precision == "bfloat16" and self._reduces
         enabled = reduced and networks.bfloat16_is_faster(kind)
-        return torch.autocast(kind, torch.bfloat16, enabled=enabled)
+        # A recorded step must not begin with weights that were cast before it.
+        return torch.autocast(kind, torch.bfloat16, enabled, cache_enabled=not self._on_gpu)
 
     def _tensor(self, column: NDArray[Any]) -> Tensor:
         return torch.from_numpy(column).to(self.device)
 
-    def _shift(self, frames: NDArray[Any]) -> NDArray[Any]:
+    def _shifted(self, seen: list[Tensor]) -> list[Tensor]:
+        return [self._shift(entry) for entry in seen]
+
+    def _shift(self, entry: Tensor) -> Tensor:
         """Shift each picture [n, 2, 45, 80] at random by a few pixels, repeating its border.
 
         By at most an eighth of a picture's shorter side. Numbers stay as they are.
         """
-        if frames.dtype.names:
-            moved = frames.copy()
-            for name in frames.dtype.names:
-                moved[name] = self._shift(frames[name])
-            return moved
-        if not networks.is_picture(frames.dtype, frames.shape[1:]):
-            return frames
-        if frames.ndim == 3:
-            return self._shift(frames[:, None])[:, 0]
-        if networks.channels_last(frames.shape[1:]):
-            return np.moveaxis(self._shift(np.moveaxis(frames, -1, 1)), 1, -1)
-        most = min(self.config.picture_shift, min(frames.shape[2:]) // 8)
+        if entry.dtype != torch.uint8 or entry.dim() not in (3, 4):
+            return entry
+        if entry.dim() == 3:
+            return self._shift(entry[:, None])[:, 0]
+        if networks.channels_last(entry.shape[1:]):
+            return self._shift(entry.movedim(3, 1)).movedim(1, 3).contiguous()
+        count, channels, *sides = entry.shape
+        most = min(self.config.picture_shift, min(sides) // 8)
         if not most:
-            return frames
-        padded = np.pad(frames, ((0, 0), (0, 0), (most, most), (most, most)), "edge")
-        corners = torch.randint(
-            2 * most + 1, (len(frames), 2), generator=self.noise, device=self.device
+            return entry
+        corners = torch.randint(2 * most + 1, (count, 2), generator=self.noise, device=self.device)
+        rows, columns = (
+            (torch.arange(side, device=self.device) + corner[:, None] - most).clamp(0, side - 1)
+            for side, corner in zip(sides, corners.T, strict=True)
         )
-        top, left = corners.cpu().numpy().T
-        windows = sliding_window_view(padded, frames.shape[2:], (2, 3))
-        return windows[np.arange(len(frames)), :, top, left]
+        planes = torch.arange(count * channels, device=self.device).view(count, channels, 1)
+        moved = entry.flatten(0, 2).index_select(0, (planes * sides[0] + rows[:, None]).flatten())
+        moved = moved.view(count, -1, sides[1])
+        return moved.gather(2, columns[:, None].expand_as(moved)).view(entry.shape)
 
     @torch.no_grad()
-    def _targets(self, batch: Batch) -> Tensor:
-        c, seen = self.config, tensors(batch.next_frames, self.device)
+    def _targets(self, batch: Tensors) -> Tensor:
+        c = self.config
         with self._precision():
-            own_picture = self.target_actor.picture(*seen)
-            pictures = [critic.picture(*seen) for critic in self.target_critics.pair]
+            own_picture = self.target_actor.picture(*batch.next_seen)
+            pictures = [critic.picture(*batch.next_seen) for critic in self.target_critics.pair]
         next_actions = torch.tanh(self.target_actor.head(own_picture))
         noise = c.target_noise * torch.randn(
             next_actions.shape, generator=self.noise, device=self.device
         )
         next_actions = equations.smoothed_target_action(next_actions, noise, c.target_noise_bound)
         first, second = _values(self.target_critics, pictures, next_actions)
-        rewards, terminals = self._tensor(batch.rewards), self._tensor(batch.terminals)
-        discount = c.gamma ** torch.as_tensor(batch.spans, device=self.device)
-        return equations.td_target(rewards, terminals, (first, second), discount)
+        values = first, second
+        return equations.td_target(batch.rewards, batch.terminals, values, batch.discount)
 
     def _critic_loss(
-        self, batch: Batch, pictures: list[Tensor], actions: Tensor, targets: Tensor, beta: float
+        self, batch: Tensors, pictures: list[Tensor], targets: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return both critics' loss, the errors [n] for the priorities, and the mean value."""
-        c, human = self.config, self._tensor(batch.human)
-        weights = equations.importance_weights(
-            self._tensor(batch.probabilities).float(), beta, c.normalise_importance
-        )
-        values = _values(self.critics, pictures, actions)
+        c, weights = self.config, batch.importance
+        values = _values(self.critics, pictures, batch.actions)
         first, second = (
-            equations.critic_loss(value, targets, human, weights, c.split_loss) for value in values
+            equations.critic_loss(value, targets, batch.human, weights, c.split_loss)
+            for value in values
         )
         loss, errors, mean = first + second, targets - values[0].detach(), values[0].detach().mean()
-        if self._charges_overruled and batch.penalised.any():
-            penalised = self._tensor(batch.penalised)
-            overruled = _values(self.critics, pictures, self._tensor(batch.overruled))
+        if batch.overruled is None:
+            return loss, errors, mean
+        overruled = _values(self.critics, pictures, batch.overruled)
+        if self._charges_overruled:
             first, second = (
-                equations.overruled_loss(value, penalised, c.intervention_penalty, weights)
+                equations.overruled_loss(value, batch.penalised, c.intervention_penalty, weights)
                 for value in overruled
             )
             loss = loss + first + second
             # The larger of the two actions' errors decides the row's priority.
-            missed = (c.intervention_penalty - overruled[0].detach()) * penalised
+            missed = (c.intervention_penalty - overruled[0].detach()) * batch.penalised
             errors = torch.where(missed.abs() > errors.abs(), missed, errors)
-        if self.algorithm.proxy_values and batch.human.any():
-            overruled = _values(self.critics, pictures, self._tensor(batch.overruled))
+        if self.algorithm.proxy_values:
             for pair in zip(values, overruled, strict=True):
-                loss = loss + equations.proxy_value_loss(*pair, human)
+                loss = loss + equations.proxy_value_loss(*pair, batch.human)
         return loss, errors, mean
 
     def _policy_loss(self, picture: Tensor, own_actions: Tensor, human: Tensor) -> Tensor:
@@ -317,45 +413,40 @@ class TD3Learner:
         return equations.policy_loss(values, human, split)
 
     def _cloning_loss(
-        self,
-        shown: Batch | None,
-        own_actions: Tensor,
-        actions: Tensor,
-        human: Tensor,
-        judged: tuple[Tensor, Tensor],
+        self, batch: Tensors, own_actions: Tensor, judged: tuple[Tensor, Tensor]
     ) -> Tensor:
-        """Return eq. 23's second term, unweighted: of ``shown``, else of the minibatch."""
-        row = self.algorithm
+        """Return eq. 23's second term, unweighted: of ``batch.shown``, else of the minibatch."""
+        row, actions, human = self.algorithm, batch.actions, batch.human
         if not row.behaviour_cloning:
             return torch.zeros((), device=self.device)
-        if shown is not None:
-            seen = tensors(self._shift(shown.frames), self.device)
-            actions, human = self._tensor(shown.actions), self._tensor(shown.human)
+        if batch.shown is not None:
+            seen, actions = self._shifted(batch.shown.seen), batch.shown.actions
+            human = torch.ones(len(actions), dtype=torch.bool, device=self.device)
             with self._precision():
                 picture = self.actor.picture(*seen)
             own_actions = torch.tanh(self.actor.head(picture))
             if row.weighted_cloning:
-                judged = self._judge(seen, actions, human, own_actions.detach())
+                everyone = torch.arange(len(actions), device=self.device)
+                judged = self._judge(seen, actions, everyone, own_actions.detach())
         weights = equations.cloning_weights(*judged) if row.weighted_cloning else None
         bound = self.config.cloning_bound
         return equations.behaviour_cloning_loss(own_actions, actions, human, weights, bound)
 
-    def _preference_loss(self, foreseen: Batch) -> Tensor:
+    def _preference_loss(self, foreseen: Choices) -> Tensor:
         """Prefer the human's action in the states to which the overruled one would have led."""
-        seen = tensors(self._shift(foreseen.next_frames), self.device)
+        seen = self._shifted(foreseen.seen)
         with self._precision():
             picture = self.actor.picture(*seen)
         actions = torch.tanh(self.actor.head(picture))
-        preferred, overruled = map(self._tensor, (foreseen.actions, foreseen.overruled))
-        return equations.preference_loss(actions, preferred, overruled, self.config.preference_beta)
+        beta = self.config.preference_beta
+        return equations.preference_loss(actions, foreseen.actions, foreseen.overruled, beta)
 
     @torch.no_grad()
     def _judge(
-        self, seen: list[Tensor], actions: Tensor, human: Tensor, own_actions: Tensor
+        self, seen: list[Tensor], actions: Tensor, looked_at: Tensor, own_actions: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return Q'(s, a) and Q'(s, pi(s)), [n] each, of the human's samples; 0 of the others."""
-        row, values = self.algorithm, torch.zeros((2, len(human)), device=self.device)
-        looked_at = human.nonzero()[:, 0]
+        """Return Q'(s, a) and Q'(s, pi(s)), [n] each, of the rows to look at; 0 of the others."""
+        row, values = self.algorithm, torch.zeros((2, len(actions)), device=self.device)
         if (row.advantage_weight or row.weighted_cloning) and len(looked_at):
             critic = self.target_critics.first
             # Copies picture by picture; [looked_at] copies byte by byte, 25 times as slow.

@@ -5,12 +5,12 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import torch
 from gymnasium import spaces
 
 from trainer.human.guide import Guide, Intervention
 from trainer.learner.config import LearnerConfig
 from trainer.learner.replay import FRAMES_LAYOUT
-from trainer.learner.td3 import Losses
 from trainer.scenarios.left_turn import LeftTurnEnv
 from trainer.training.config import RunConfig
 from trainer.training.learning import LearningThread
@@ -120,15 +120,15 @@ def scripted_run(run_dir, config=CONFIG, length=1, outcome="goal", human_steps=(
             run.written.append((indices.tolist(), priorities.tolist()))
         write(indices, priorities)
 
-    def update(batch, beta):
+    def begin(batch, beta):
         priorities = 2.0 + len(run.learned) + np.arange(BATCH) / 8
         run.learned.append((batch.indices.tolist(), priorities.tolist()))
-        return Losses(0.0, 0.0, 0.0, 0.0, priorities)
+        return torch.tensor([0.0, 0.0, 0.0, 0.0, *priorities])
 
     changed: Any = SimpleNamespace(learner=learning.learner, replay=learning.replay)
     changed.replay.add, changed.replay.update_priorities = spy_add, spy_write
     changed.learner.actor.act = lambda seen: np.full((len(seen), 1), POLICY, np.float32)
-    changed.learner.update = update
+    changed.learner.begin = begin
     return run
 
 

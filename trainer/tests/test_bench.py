@@ -1,15 +1,20 @@
 import json
 
+import pytest
+import torch
+
 from hil_tests.tests.shared.commands import call
 from trainer import bench
+from trainer.learner.config import LearnerConfig
 from trainer.scenarios import SCENARIOS
+from trainer.training.config import RunConfig
 
 
 def test_the_report_holds_the_three_figures_and_their_parts(capsys, tmp_path, monkeypatch):
     for name, small in {"ROUNDS": 2, "UPDATES": 1, "STEPS": 10}.items():
         monkeypatch.setattr(bench, name, small)
     whole = bench.measure
-    monkeypatch.setattr(bench, "measure", lambda: whole(batch_size=4))
+    monkeypatch.setattr(bench, "measure", lambda device: whole(device, batch_size=4))
     out = tmp_path / "b.json"
     status, said, _ = call(capsys, "bench", "--threads", "1", "--out", str(out))
     assert status == 0
@@ -21,3 +26,19 @@ def test_the_report_holds_the_three_figures_and_their_parts(capsys, tmp_path, mo
     assert set(parts) == {"total", *bench.PARTS}
     assert 0 < parts["environment"] < parts["total"]
     assert json.loads(said) == report
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_a_gpus_report_has_the_other_library_and_the_floor(monkeypatch):
+    for name, small in {"ROUNDS": 2, "UPDATES": 1, "STEPS": 10}.items():
+        monkeypatch.setattr(bench, name, small)
+    found = bench.measure("cuda", batch_size=16)["on_gpu"]
+    assert 0.0 < found["ms_per_replay"] < found["ms_per_update"]
+    assert found["ms_per_step_of_stable_baselines3"] > 0.0
+
+
+def test_the_other_library_drives_and_learns():
+    config = RunConfig(learner=LearnerConfig(batch_size=4))
+    model = bench.stable_baselines3(config)
+    model.train(1, 4)
+    assert model.num_timesteps == 8

@@ -19,7 +19,6 @@ from edge_runtime.util import UserError
 from trainer.evaluation import BEST_FILE, CHECKPOINT_FILE
 from trainer.learner.config import LearnerConfig
 from trainer.learner.replay import Transition
-from trainer.learner.td3 import Losses
 from trainer.tests.loops import (
     BATCH,
     CONFIG,
@@ -88,6 +87,12 @@ def test_learning_waits_for_the_warmup_and_writes_each_updates_priorities_back(
     assert run.written == run.learned
 
 
+def test_as_many_updates_follow_a_step_as_are_asked_for(tmp_path):
+    run = trained(tmp_path, 4, warmup_steps=1, updates_per_step=3)
+    assert len(run.learned) == 3 * 3
+    assert run.written == run.learned
+
+
 def test_a_human_at_the_wheel_does_not_drive_against_the_brake_of_a_silent_network(tmp_path):
     run = trained(tmp_path, 7, human_steps=(4, 5), latency="up.loss=100%")
     assert run.env.braked == [False, False, True, False, False, True, True]
@@ -111,7 +116,7 @@ def test_a_budget_in_steps_ends_the_run_with_the_episode_under_way(tmp_path):
 
 
 def bad_update(run):
-    run.learning.learner.update = lambda *_: Losses(0.0, 0.0, 0.0, 0.0, np.full(BATCH, np.nan))
+    run.learning.learner.begin = lambda *_: torch.full((4 + BATCH,), torch.nan)
 
 
 def bad_action(run):
@@ -149,20 +154,20 @@ def transition(reward: float = 0.0, action: float = 0.5, **more: Any) -> Transit
 def test_an_update_runs_beside_the_step_and_knows_what_was_stored_before_it(tmp_path):
     run = scripted_run(tmp_path, CONFIG, length=4)
     begun, moved, known = threading.Event(), threading.Event(), []
-    update, step = run.learning.learner.update, run.env.step
+    begin, step = run.learning.learner.begin, run.env.step
 
     def slow_update(batch, beta):
         begun.set()
         assert moved.wait(10.0)  # so it is still at work when the environment is done
         known.append(len(run.stored))
-        return update(batch, beta)
+        return begin(batch, beta)
 
     def step_beside(action):
         assert not run.stored or begun.wait(10.0)
         moved.set()
         return step(action)
 
-    run.learning.learner.update, run.env.step = slow_update, step_beside
+    run.learning.learner.begin, run.env.step = slow_update, step_beside
     run.train()
     assert known == [1, 2, 3]
 
@@ -182,14 +187,14 @@ def unhurried(one_thread):
 def gate(unhurried, monkeypatch):
     """Updates are held up until it is open."""
     learner, gate = unhurried.learner, SimpleNamespace(open=threading.Event(), begun=0)
-    update = learner.update
+    begin = learner.begin
 
     def held_up(batch, beta=0.0):
         gate.begun += 1
         assert gate.open.wait(SOON_S)
-        return update(batch, beta)
+        return begin(batch, beta)
 
-    monkeypatch.setattr(learner, "update", held_up)
+    monkeypatch.setattr(learner, "begin", held_up)
     return gate
 
 
@@ -200,7 +205,7 @@ def test_while_an_update_hangs_everything_goes_on(unhurried, gate):
         np.testing.assert_array_equal(unhurried.act(PICTURE), before)
         unhurried.begin(0.0)
         assert unhurried.finish() == 0.0
-    assert not unhurried._begun[1].done()
+    assert not unhurried._begun.done()
     assert gate.begun <= 1
     gate.open.set()
     unhurried.settle()

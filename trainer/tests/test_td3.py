@@ -1,17 +1,20 @@
 """The learner: its networks, learning rates, shifted pictures and precision."""
 
+import copy
 import itertools
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from trainer.learner import networks
-from trainer.learner.config import PHIL
+from trainer.learner.config import ALGORITHMS, PHIL
 from trainer.learner.networks import FEATURES, Actor, Critic
-from trainer.learner.td3 import TD3Learner
-from trainer.tests.learners import SMALL, make_batch, same_weights
+from trainer.learner.td3 import Losses, TD3Learner
+from trainer.tests.learners import SMALL, make_batch, same_weights, weights_of
 
 
 def test_the_networks_are_those_of_tables_a2_to_a4():
@@ -54,7 +57,7 @@ def test_pictures_are_shifted_by_some_pixels_and_by_no_more():
     frames = make_batch(size=60).frames
     around = np.pad(frames, ((0, 0), (0, 0), (most, most), (most, most)), "edge")
     seen = set()
-    for shifted, padded in zip(learner._shift(frames), around, strict=True):
+    for shifted, padded in zip(learner._shift(torch.from_numpy(frames)), around, strict=True):
         places = [
             (top, left)
             for top, left in itertools.product(range(2 * most + 1), repeat=2)
@@ -90,3 +93,69 @@ def processor(monkeypatch):
 def test_the_flags_of_a_processor_decide_and_an_intels_matrix_unit(processor, lines, tiles, faster):
     processor(*lines, tiles=tiles)
     assert networks.bfloat16_is_faster("cpu") == faster
+
+
+ROWS = pytest.mark.parametrize("name", ["phil_td3", "phil_weighted", "pvp4real_td3", "ppl_td3"])
+READS = ("_local_scalar_dense", "nonzero", "masked_select", "equal", "unique")
+
+
+class NothingIsRead(TorchDispatchMode):
+    """Fail where a tensor's content is looked at, which would make a GPU wait."""
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        assert not any(name in str(func) for name in READS), func
+        return func(*args, **kwargs or {})
+
+
+@pytest.mark.parametrize("delayed", [False, True])
+@ROWS
+def test_a_step_that_a_gpu_records_looks_at_nothing_and_is_the_processors(
+    name, delayed, monkeypatch
+):
+    settings = replace(SMALL, picture_shift=3, policy_delay=1 + delayed)
+    learner, recorded = (TD3Learner(settings, ALGORITHMS[name], seed=0) for _ in range(2))
+    shown = make_batch(9, humans=7, size=7) if name == "phil_weighted" else None
+    for seed, humans in enumerate((4, 0)):
+        batch = replace(make_batch(seed, humans), shown=shown)
+        wanted = learner.update(batch, beta=0.5)
+        recorded.updates += 1
+        with monkeypatch.context() as patch:
+            patch.setattr(TD3Learner, "_on_gpu", True)
+            prepared = recorded._prepare(batch, beta=0.5)
+            with NothingIsRead():
+                figures = recorded._step(prepared, recorded.updates % settings.policy_delay == 0)
+        found = Losses.of(figures)
+        np.testing.assert_allclose(found[:4], wanted[:4], rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(found.priorities, wanted.priorities, rtol=1e-4)
+    for key, flat in weights_of(learner).items():
+        assert (flat - weights_of(recorded)[key]).abs().max() < 2e-5
+
+
+on_a_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+
+
+@on_a_gpu
+@ROWS
+def test_on_a_gpu_a_resumed_learner_has_the_bits_of_one_that_never_stopped(name):
+    settings = replace(SMALL, precision="bfloat16", picture_shift=3)
+    learner, resumed = (TD3Learner(settings, ALGORITHMS[name], s, device="cuda") for s in (0, 1))
+    for seed in range(12):
+        if seed == 6:
+            resumed.load_state_dict(copy.deepcopy(learner.state_dict()))
+        for each in (learner, resumed):
+            each.update(make_batch(seed, humans=seed % 5))
+            each.decay(seed / 12)
+    assert same_weights(learner, resumed)
+
+
+@on_a_gpu
+@ROWS
+def test_a_recorded_step_learns_what_the_processors_does(name):
+    settings = replace(SMALL, target_noise=0.0)
+    learner, on_gpu = (TD3Learner(settings, ALGORITHMS[name], 0, device=d) for d in ("cpu", "cuda"))
+    for seed in range(8):
+        batch = make_batch(seed, humans=seed % 5)
+        wanted, found = learner.update(batch), on_gpu.update(batch)
+        np.testing.assert_allclose(found[:4], wanted[:4], rtol=0.01, atol=1e-3)
+        for each in (learner, on_gpu):
+            each.decay(seed / 8)
