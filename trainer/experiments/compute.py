@@ -75,7 +75,11 @@ def run(arguments: argparse.Namespace) -> int:
     if alone and len(names) > 1 and names != {"status", study.name}:
         raise UserError(f"{', '.join(sorted(alone))}: no other name goes with it")
     store = _store(arguments, study)
-    units = store.study.units(seeds, arguments.scenario, names)
+    kind = arguments.algorithm, arguments.setting
+    units = [
+        unit for unit in store.study.units(seeds, arguments.scenario, names)
+        if all(wanted in (None, own) for wanted, own in zip(kind, unit[1:3], strict=True))
+    ]  # fmt: skip
     if "status" in names:
         there = store.load(units, seeds)
         done = Counter(unit[:3] for unit in there.found)
@@ -103,7 +107,7 @@ def _store(arguments: argparse.Namespace, study: Study) -> Store:
 def compute_missing(arguments: argparse.Namespace, store: Store, wanted: Sequence[Unit]) -> int:
     """Compute the units that have no current record; return how many failed."""
     if not wanted:
-        raise UserError(f"{', '.join(arguments.names)}: nothing to compute in {arguments.scenario}")
+        raise UserError(f"{', '.join(arguments.names)}: there is no such training")
     check_device(arguments.device)
     stop_at_s = deadline_s(arguments.max_minutes, time.time)  # The clock of all processes
     done = {*store.load(wanted, arguments.seeds).found}
