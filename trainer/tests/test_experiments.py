@@ -350,6 +350,11 @@ class TestCommand:
         assert "constant actions in the left turn is" in (results / "README.md").read_text()
         assert "1 of 1 units were there already" in call(capsys, "experiment", "floor", *more)[1]
 
+    def test_one_row_in_one_setting_can_be_chosen(self, capsys):
+        chosen = ("--algorithm", "phil_td3", "--setting", "four_updates")
+        assert len(call(capsys, "experiment", "guidance", "status", *chosen)[1].splitlines()) == 3
+        refusal(capsys, "experiment", "guidance", "--setting", "printed")
+
     @pytest.mark.parametrize("names", ["status report", "guidance fig7"])
     def test_names_that_do_not_go_together_are_refused(self, capsys, names):
         refusal(capsys, "experiment", *names.split())
