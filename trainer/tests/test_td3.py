@@ -1,9 +1,11 @@
 """The learner: its networks, learning rates, shifted pictures and precision."""
 
+import contextlib
 import copy
 import itertools
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -13,7 +15,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from trainer.learner import networks
 from trainer.learner.config import ALGORITHMS, PHIL
 from trainer.learner.networks import FEATURES, Actor, Critic
-from trainer.learner.td3 import Losses, TD3Learner
+from trainer.learner.recorded import WARM_UPS, RecordedStep
+from trainer.learner.td3 import Choices, Losses, TD3Learner
 from trainer.tests.learners import SMALL, make_batch, same_weights, weights_of
 
 
@@ -129,6 +132,32 @@ def test_a_step_that_a_gpu_records_looks_at_nothing_and_is_the_processors(
         np.testing.assert_allclose(found.priorities, wanted.priorities, rtol=1e-4)
     for key, flat in weights_of(learner).items():
         assert (flat - weights_of(recorded)[key]).abs().max() < 2e-5
+
+
+def test_a_recorded_step_is_replayed_on_the_batch_of_each_call(monkeypatch):
+    """What stands in for the GPU runs the step where a GPU records it, and at each replay."""
+    calls: list[Choices] = []
+    answer, device = torch.empty(3), torch.device("cpu")
+    graph = SimpleNamespace(register_generator_state=lambda _: None)
+
+    def step(batch):
+        calls.append(batch)
+        return answer.copy_(batch.seen[0] + batch.actions)
+
+    def begin_recording(*_, **__):
+        graph.replay = lambda: step(calls[-1])
+        return contextlib.nullcontext()
+
+    stream = SimpleNamespace(wait_stream=lambda _: None)
+    for name, made in {"Stream": stream, "current_stream": stream, "CUDAGraph": graph}.items():
+        monkeypatch.setattr(torch.cuda, name, lambda *_, made=made: made)
+    monkeypatch.setattr(torch.cuda, "stream", contextlib.nullcontext)
+    monkeypatch.setattr(torch.cuda, "graph", begin_recording)
+    recorded = RecordedStep(step, cast(torch.Generator, SimpleNamespace(device=device)))
+    for number in range(2 * WARM_UPS):
+        batch = Choices([torch.full((3,), float(number))], torch.ones(3), cast(torch.Tensor, None))
+        assert recorded(batch).tolist() == [number + 1.0] * 3
+    assert len({id(batch.actions) for batch in calls[WARM_UPS:]}) == 1
 
 
 on_a_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
