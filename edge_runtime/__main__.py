@@ -109,8 +109,8 @@ def _rearm(arguments: argparse.Namespace) -> int:
     if tls is not None:
         check_name(tls.name, common_name(OPERATOR, arguments.vehicle_id))
     answer = partial(ask, arguments.connect, arguments.vehicle_id, tls=tls)
-    stop = None  # the one that is seen now: late, a re-arm is for no other
-    with contextlib.suppress(UserError):
+    stop = "none seen"  # late, a re-arm is for no other
+    with contextlib.suppress(UserError):  # the second question tells why
         seen = answer("status")
         newest = seen["command"] or {}
         stop = f"{newest.get('session')}/{newest.get('episode')}/{seen['safe_stops']}"
