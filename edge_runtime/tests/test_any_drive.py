@@ -187,6 +187,7 @@ class AnyDrive(RuleBasedStateMachine):
         scale = self.rig.core.similarity.scale
         self.rig.core = HunterRig(scale=scale).core
         self.rig.core.follow_period(T)
+        self.letters.clear()  # those under way end with the process
         self.start(cap_mps, leash_m)
 
     def state(self, final: bool = False, held_s: float = 0.0) -> None:
@@ -246,10 +247,10 @@ class AnyDrive(RuleBasedStateMachine):
     def judge(self, now_s: float) -> None:
         speed_mps = self.rig.speed_mps
         assert abs(speed_mps) <= 1.03 * self.cap_mps, "above its cap"
-        assert self.gone_m <= self.leash_m + self.cap_mps * REACTS_S, "beyond its leash"
         if speed_mps == 0.0:
             return
         self.moved_s = now_s
+        assert self.gone_m <= self.leash_m + self.cap_mps * REACTS_S, "beyond its leash"
         assert self.permit, "nobody let it move"
         if self.each_episode and now_s - self.begun_s > REACTS_S:
             assert self.permit == self.place, "it was let move in another episode"
