@@ -226,7 +226,8 @@ def run(arguments: argparse.Namespace) -> int:
     tls = tls_for(asked.tls, asked.connect or asked.listen)
     manifest = load_manifest(asked.policy, asked.public_key, asked.allow_unsigned)
     task = Task(**{name: getattr(manifest, name) for name in Task.__struct_fields__})
-    make = _load(asked.source)
+    with sigterm_as_interrupt():  # and so afterwards, whatever the import does to signals
+        make = _load(asked.source)
     with sigterm_as_interrupt(), _open(asked, vehicle_id, task, tls) as end:
         try:
             source = _Source(make, task)
