@@ -38,6 +38,7 @@ SOURCE_FAILED = 1  # exit status
 # A camera's noise changes each picture: one that stays is frozen, or the lens is covered.
 FROZEN_PERIODS = 5
 GIVES_UP_S = 2.0  # so long without a state, and the command ends: the vehicle stopped long ago
+TELLS_S = 10.0
 ROUNDING_S = 1e-9
 _POLL_S = 0.1  # a signal that another thread got wakes nobody: so it polls
 
@@ -225,11 +226,14 @@ def run(arguments: argparse.Namespace) -> int:
     tls = tls_for(asked.tls, asked.connect or asked.listen)
     manifest = load_manifest(asked.policy, asked.public_key, asked.allow_unsigned)
     task = Task(**{name: getattr(manifest, name) for name in Task.__struct_fields__})
-    make = _load(asked.source)
+    with sigterm_as_interrupt():  # and so afterwards, whatever the import does to signals
+        make = _load(asked.source)
     with sigterm_as_interrupt(), _open(asked, vehicle_id, task, tls) as end:
         try:
             source = _Source(make, task)
-            source.answer()  # The first one is not sent: a camera takes its time to open.
+            # The first one is not sent: a camera takes its time to open.
+            while source.answer(time.monotonic() + TELLS_S) is None:
+                print(f"waiting: {asked.source} has observed nothing yet", flush=True)
             print(f"ready vehicle_id={vehicle_id} source={asked.source}", flush=True)
             _sense(source, end, task, tls)
         except SourceError as error:
@@ -271,7 +275,7 @@ def _load(place: str) -> Callable[[], Any]:
     module, _, member = place.partition(":")
     try:
         return getattr(import_module(module), member)
-    except BaseException as error:  # a module may raise anything when it is imported
+    except (Exception, SystemExit) as error:  # a module may raise anything when it is imported
         raise UserError(f"no source {place!r}: {type(error).__name__}: {error}") from None
 
 

@@ -24,7 +24,15 @@ from edge_runtime.manifest import Entry, Layout
 from edge_runtime.policy import load_manifest
 from edge_runtime.reach import free_endpoint
 from edge_runtime.safety import Mode
-from edge_runtime.sense import FROZEN_PERIODS, GIVES_UP_S, Intake, Seen, SourceError, look
+from edge_runtime.sense import (
+    FROZEN_PERIODS,
+    GIVES_UP_S,
+    Intake,
+    Seen,
+    SourceError,
+    _Source,
+    look,
+)
 from edge_runtime.util import UserError
 from edge_runtime.wire import DRIVE, encode
 
@@ -367,6 +375,42 @@ def test_what_is_too_old_is_said_and_what_cannot_be_read_ends_it(folder, capsys,
     found, out, err = call(capsys, *words, *listen, package="bridge")
     assert (found, out.count("too old"), len(err.splitlines())) == (1, 1, 1)
     assert "int, not frames" in err
+
+
+def test_an_interrupt_while_a_source_is_imported_is_one(folder, capsys, monkeypatch):
+    (folder / "interrupted.py").write_text("raise KeyboardInterrupt")
+    monkeypatch.syspath_prepend(folder)
+    words = ("--source", "interrupted:Source", "--policy", make_policy(folder), "--allow-unsigned")
+    assert call(capsys, "sense", *words, package="edge_runtime")[0] == 130
+
+
+def test_a_source_that_is_imported_takes_no_signal_away(folder, capsys, monkeypatch):
+    (folder / "deaf.py").write_text("import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)")
+    monkeypatch.syspath_prepend(folder)
+    before = signal.getsignal(signal.SIGINT)
+    words = ("--source", "deaf:Source", "--policy", make_policy(folder), "--allow-unsigned")
+    try:
+        assert call(capsys, "sense", *words, package="edge_runtime")[0] == 2  # there is no Source
+        assert signal.getsignal(signal.SIGINT) == before
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_a_source_that_never_begins_is_waited_for_and_said_to_be(folder, capsys, monkeypatch):
+    answers = iter([None, None])
+
+    def answer(*_):
+        for each in answers:
+            return each
+        raise KeyboardInterrupt
+
+    monkeypatch.syspath_prepend(folder)
+    monkeypatch.delitem(sys.modules, "my_source", raising=False)
+    monkeypatch.setattr(_Source, "answer", answer)
+    words = ("--source", "my_source:Few", "--policy", make_policy(folder), "--allow-unsigned")
+    listen = ("--listen", free_endpoint())
+    status, out, _ = call(capsys, "sense", *words, *listen, package="edge_runtime")
+    assert (status, out.count("waiting")) == (130, 2)
 
 
 def test_a_hanging_source_holds_no_signal(folder):
