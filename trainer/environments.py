@@ -9,7 +9,6 @@ and, in the last step, the outcome. `Adapted` brings any environment into that f
 import copy
 import math
 from collections.abc import Callable, Mapping
-from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +22,7 @@ from bridge.inbound import ROUNDING_S
 from bridge.network import COMMAND_WINDOW, LatencySpec, VirtualLink
 from bridge.outcomes import outcome_of
 from edge_runtime.manifest import Task
-from edge_runtime.util import UserError
+from edge_runtime.util import UserError, load_named
 from edge_runtime.wire import DRIVE, Command
 from trainer.human.guide import Action, Expert, Reason
 from trainer.learner.replay import Observation, ReplayLayout
@@ -155,14 +154,6 @@ def expert_of(env: Any, human: str = "expert") -> Expert:
         return _ScaledExpert(env, made(env.unwrapped))
     except Exception as error:  # It may raise anything
         raise UserError(f"no expert {human!r}: {type(error).__name__}: {error}") from error
-
-
-def load_named(place: str, what: str) -> Any:
-    """Import ``module:name``; UserError where that fails."""
-    try:
-        return EntryPoint(place, place, "").load()
-    except Exception as error:  # A module may raise anything when it is imported
-        raise UserError(f"no {what} {place!r}: {type(error).__name__}: {error}") from error
 
 
 def outer(action_range: tuple[Any, Any], action: Any) -> NDArray[np.float32]:
