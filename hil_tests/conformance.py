@@ -17,7 +17,7 @@ from edge_runtime import log
 from edge_runtime.cli import examples
 from edge_runtime.config import NONE, load_config
 from edge_runtime.files import check_writable, write_json_out
-from edge_runtime.jog import bench_manifest
+from edge_runtime.jog import bench_manifest, in_words
 from edge_runtime.util import UserError, printable
 from edge_runtime.vehicles import make_vehicle
 from edge_runtime.vehicles.base import Vehicle, VehicleReport, close_in_time
@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         for rule, is_kept in RULES.items():
             try:
-                wrong = "" if is_kept(bench) else in_words(bench.last)
+                wrong = "" if is_kept(bench) else f"last report: {in_words(bench.last)}"
             # A driver may raise anything, and the next rule is due.
             except (Exception, SystemExit) as error:
                 wrong = f"{type(error).__name__}: {error}"
@@ -69,14 +69,6 @@ def run(arguments: argparse.Namespace) -> int:
     return 0 if kept == len(RULES) else 1
 
 
-def in_words(report: VehicleReport | None) -> str:
-    if report is None:
-        return "it has not reported yet"
-    told = {**report._asdict(), **report.action, "faults": "; ".join(report.faults), "action": None}
-    words = (f"{name} {value}" for name, value in told.items() if value is not None)
-    return f"last report: {', '.join(words)}"
-
-
 class Bench:
     """Calls a driver as the runtime does, times the calls and keeps the last report."""
 
@@ -85,7 +77,7 @@ class Bench:
         vehicle.control_period_s = period_s
         self.go = {name: limit.high for name, limit in vehicle.limits.items()}
         self.longest_s, self.well_formed = 0.0, True
-        self.last: VehicleReport | None = None
+        self.last = VehicleReport({}, 0.0, True, [])
 
     def call(self, name: str, *arguments: Any, **options: Any) -> Any:
         """Call the driver with the time, and with a command's speed."""
