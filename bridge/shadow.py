@@ -1,8 +1,7 @@
 """``python -m bridge shadow``: a policy beside the one that drives; it answers and moves nothing.
 
-It hears the states that the driving runtime gets, on the wire or from a recording, and decides as
-the edge runtime would. Its answers go into view, recording and report only: it opens a listener,
-which has no way to publish.
+It decides as the edge runtime would, on the wire's states or a recording's. Its answers go into
+view, recording and report only: a listener has no way to publish.
 """
 
 from __future__ import annotations
@@ -166,10 +165,7 @@ class Shadow:
         yield Heard(key, SHADOW, payload, heard.arrived_ns, len(payload))
 
     def _infer(self, state: State) -> tuple[np.ndarray | None, int]:
-        """Return the network's action, or None, and how long it took, ns.
-
-        More than T stands for longer. A network that hangs is asked again when it has ended.
-        """
+        """Return the network's action, or None, and how long it took, ns; more than T: longer."""
         seen, found = self._policy.layout.arrays(state.observation), []
 
         def infer() -> None:

@@ -122,10 +122,9 @@ class SequentialTest:
 
 
 class Search:
-    """Looks for edges, and keeps the verdict of every point that was tried.
+    """Looks for edges, and hands the verdict of every point that was tried to ``keep``.
 
-    ``drive`` is called with the next AT_ONCE seeds, from ``seed`` on, until a point is decided, and
-    ``keep`` after it.
+    ``drive`` is called with the next AT_ONCE seeds, from ``seed`` on, until a point is decided.
     """
 
     def __init__(
@@ -248,10 +247,7 @@ class UntoldError(UserError):
 
 
 class Drivers(ProcessPoolExecutor):
-    """A pool of processes, each with an environment and the policy; 0 jobs: one a core.
-
-    Raises UserError where the policy does not load or the environment cannot be made.
-    """
+    """Processes, each with an environment and the policy; 0 jobs: one a core. UserError."""
 
     def __init__(self, policy: str, env: str, condition: str, public_key: str | None, jobs: int):
         policy = located(policy)

@@ -119,7 +119,6 @@ def garbage_commands(rig: Rig) -> Try:
 
 
 def _command(rig: Rig, ahead: int = 0, **changes: object) -> Command:
-    """Make a drive command to the newest state, or to one ``ahead`` of it."""
     session, episode, step = rig.timeline.commands[-1].place
     middle = [0.45 * one.low + 0.55 * one.high for one in rig.task.action]
     fields: dict[str, Any] = {
@@ -183,7 +182,6 @@ def mutated(valid: bytes, count: int, seed: int) -> Iterator[bytes]:
 
 
 def with_fields(valid: bytes, **changes: object) -> bytes:
-    """Replace fields of a MessagePack map by values of any type."""
     return msgspec.msgpack.encode({**msgspec.msgpack.decode(valid), **changes})
 
 
