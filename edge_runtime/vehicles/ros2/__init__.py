@@ -149,6 +149,8 @@ class Ros2Settings(RobotSettings, frozen=True, kw_only=True):
                 f"endpoint {endpoint} is not for the ROS 2 side: it speaks plain text, as DDS does;"
                 " use tcp/ or udp/ on one machine, or inside a tunnel"
             )
+        for topic in (self.twist_topic, self.odometry_topic):
+            topic_key(self.namespace, topic)
 
 
 class Ros2Core(streamed.StreamedCore):
