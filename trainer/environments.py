@@ -1,9 +1,8 @@
 """Environments by name: the two scenarios, and any other environment adapted to look like them.
 
-The trainer sees every environment in one form: an observation is one array (a structured one for
-several entries), an action is float32 [n] in [-1, 1], and a step's ``info`` holds position, speed
-and, in the last step, the outcome. `Adapted` brings any environment into that form; `outer` and
-`inner` are the only places where actions are scaled.
+An observation is one array (a structured one for several entries), an action is float32 [n] in
+[-1, 1]; `outer` and `inner` alone scale it. A step's ``info`` holds position, speed and, in the
+last step, the outcome.
 """
 
 import copy
@@ -64,14 +63,12 @@ def make_environment(
     period_s: float | None = None,
     success: str = "",
 ) -> Any:
-    """Make the environment of a scenario's word, a gymnasium id or ``module:id``.
+    """Make the environment of a scenario's word, a gymnasium id or ``module:id``; UserError.
 
-    The two scenarios come as they are, in the scene of a test condition; any other environment is
-    `Adapted`. With ``printed_reward`` a scenario pays what eq. 31 or 32 says, without its own
-    weight. A step lasts ``period_s`` where given, else what the environment says, else 0.1 s, which
-    a line says. ``success`` is ``module:function`` that judges the episodes of one that does not.
-
-    Raises UserError for no such environment, or one that cannot be driven here.
+    The two scenarios come as they are, in the scene of a test condition; any other is `Adapted`.
+    With ``printed_reward`` a scenario pays what eq. 31 or 32 says, without its own weight. A step
+    lasts ``period_s``, else what the environment says, else 0.1 s, which a line says. ``success``
+    is a ``module:function`` that judges the episodes of one that does not.
     """
     name, scene = scenario_of(name), CONDITIONS[condition].scene
     if name not in SCENARIOS:
@@ -139,12 +136,7 @@ def check_foresight(env: Any) -> None:
 
 
 def expert_of(env: Any, human: str = "expert") -> Expert:
-    """Return the environment's scripted expert, with a memory of its own.
-
-    ``human`` may be ``module:Class`` of another expert, which is made from the environment.
-
-    Raises UserError where there is none.
-    """
+    """Return the environment's scripted expert, or another, ``module:Class``; UserError: none."""
     if ":" not in human:
         if env.expert is None:
             raise UserError(f"{env.scenario} offers no expert(); name one as module:Class")
@@ -172,8 +164,7 @@ def inner(action_range: tuple[Any, Any], action: Any) -> Action:
 class Adapted(bridge.Adapter):
     """Any environment in the form of the two scenarios.
 
-    It has Box or flat Dict observations, and a Box of actions with finite bounds. ``name`` is the
-    name by which it was made; ``judge`` says at an episode's end whether it succeeded. Raises
+    It was made by the ``name``; ``judge`` says at an episode's end whether it succeeded. Raises
     UserError for what `bridge.environments.describe` refuses.
     """
 
