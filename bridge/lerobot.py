@@ -235,7 +235,6 @@ def _write_tables(
 
 
 def _column(values: np.ndarray) -> Any:
-    """Return a column of plain numbers or texts, or of lists of a fixed length."""
     column, size = pa.array(values.ravel()), values.size // len(values)
     return column if size == 1 else pa.FixedSizeListArray.from_arrays(column, size)
 

@@ -140,7 +140,6 @@ def make_policy(model: bytes, task: Task, algorithm: str, training: dict[str, An
 
 
 def _rename(graph: onnx.GraphProto, old: str, new: str) -> None:
-    """Rename a value wherever it stands; another value of the new name makes room."""
     swap = {old: new, new: f"{new}_of_the_model"} if old != new else {}
     for value in (*graph.input, *graph.output, *graph.value_info, *graph.initializer):
         value.name = swap.get(value.name, value.name)

@@ -123,8 +123,9 @@ def load_config(path: Optional[PathLike], flags: Dict[str, Any], opens_link: boo
     bus = given.pop("bus", None)
     settings: Dict[str, Any] = {}
     if path is not None:
+        tables = read_toml(path, "config file")
         try:
-            settings = _split_vehicle(read_toml(path, "config file"))
+            settings = _split_vehicle(tables)
             _check(convert(settings, Config))
         except UserError as error:
             raise UserError(f"config file {path}: {error}") from None
@@ -147,6 +148,9 @@ def _split_vehicle(tables: Dict[str, Any]) -> Dict[str, Any]:
     settings = dict(tables["vehicle"])
     driver = settings.pop("driver", NONE)
     rules = {name: settings.pop(name) for name in _RULES if name in settings}
+    for name in (name for name, value in settings.items() if not isinstance(value, dict)):
+        known = f"driver, {', '.join(_RULES)} and a table for each driver"
+        raise UserError(f"vehicle.{name} is no setting; [vehicle] has {known}")
     return {**tables, **rules, "vehicle": driver, "vehicle_settings": settings}
 
 

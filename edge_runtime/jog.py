@@ -203,7 +203,7 @@ def _steering(jog: Jog, name: str) -> str:
         jog.steering = 0.0
         jog.go_on(False, SOON_S)
         jog.stop()
-        jog.ask(name, f"they did turn to the {side}")
+        jog.ask(name, f"did they turn to the {side}?")
     return ", ".join(f"{share:.0%}" for share in shares) + " of what was asked"
 
 
@@ -213,7 +213,7 @@ def _crawl(jog: Jog, name: str) -> str:
     jog.go_on(True, CRAWLS_S, never=lambda it: it.faults or it.speed_mps < least_mps)
     measured = jog.measured()
     jog.stop()
-    jog.ask(name, "they did turn FORWARDS")
+    jog.ask(name, "did they turn FORWARDS?")
     return measured
 
 
@@ -226,10 +226,10 @@ def _stops(
 
 
 _SLOW = f"the wheels turn forwards, at {CRAWL_MPS:g} m/s at most"
-_WAITS = f"stops within {BRAKES_S:g} s, tells why, refuses; let go, it stands until a re-arm"
+_WAITS = f"stops within {BRAKES_S:g} s, tells why, and refuses a re-arm until it is let go of"
 _PRESS = "after Enter press the emergency stop within"
-_CRAWL = f"{1 - SPEED_OFF:.0%} to {OVER_CAP:.0%} of that, or of a lower cap"
-_ANGLE = f"{1 - STEERING_OFF:.0%} to {1 + STEERING_OFF:.0%} of what is asked, at most 5 degrees"
+_CRAWL = f"{1 - SPEED_OFF:.0%} to {OVER_CAP:.0%} of {CRAWL_MPS:g} m/s, or of a lower cap"
+_ANGLE = f"{1 - STEERING_OFF:.0%} to {1 + STEERING_OFF:.0%} of the angle asked, at most 5 degrees"
 # Name, what the driver needs (`Jog.has`), what moves and what the operator does, what is expected,
 # and what does it and returns what was measured; where it raises, the jog is over.
 Step = Tuple[str, Tuple[str, ...], str, str, Callable[[Jog, str], str]]

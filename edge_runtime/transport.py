@@ -206,9 +206,8 @@ def open_simulator(
 ) -> Iterator[_End]:
     """Listen at `listen` for the edge runtime, or share the router at `connect` with others.
 
-    With `tls`, every other party has the rights of its certificate's name and no more; behind a
-    router it is the router that sees to that.
-    UserError if the port is busy, or if no router answers within `wait_s`.
+    With `tls`, every other party has the rights of its certificate's name and no more, by the
+    listener or router. UserError if the port is busy, or if no router answers within `wait_s`.
     """
     rules = None if tls is None else rules_for_simulator(tls, vehicle_id, connect is None)
     # Behind a router a client: two peers there would not hear one another.

@@ -80,7 +80,6 @@ class Bench:
         self.last = VehicleReport({}, 0.0, True, [])
 
     def call(self, name: str, *arguments: Any, **options: Any) -> Any:
-        """Call the driver with the time, and with a command's speed."""
         now_s = time.monotonic()
         more = {"command": (now_s, None), "close": ()}.get(name, (now_s,))
         try:
@@ -154,7 +153,6 @@ class Bench:
         return True
 
     def stays_within(self) -> bool:
-        """Return whether its actuators stay within the limits, when far more is asked."""
         for _ in range(10):
             self.call("command", {name: 10.0 * value for name, value in self.go.items()})
             action = self.report(self.period_s / 2).action

@@ -107,7 +107,6 @@ def drive(folder: Path, trust: tuple[str, ...]) -> dict[str, dict[str, Any]]:
 
 
 def drives_table(reports: dict[str, dict[str, Any]]) -> str:
-    """Make a row for each report, under its name; latency from state sent to command received."""
     rows = []
     for name, report in reports.items():
         distance, latency = report["surviving_distance_m"], report.get("latency_ms")

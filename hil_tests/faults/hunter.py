@@ -50,7 +50,6 @@ class Expect(NamedTuple):
 
 
 def speed_mps(data: bytes) -> float:
-    """Decode the speed of SET_POINT or SPEED by hand."""
     return int.from_bytes(data[:2], "big", signed=True) * 1e-3
 
 
