@@ -35,7 +35,8 @@ CONTROL_PERIOD_S, LOOK_S, HOLDS_S, SOON_S, LATER_S = 0.1, 0.02, 0.5, 1.0, 4.0
 BRAKES_S = 0.8  # a Hunter's driver locks the parking brake after 1 s
 PERSON_S, PERSON_CRAWLS_S = 30.0, 10.0  # to reach for a button
 PASSED, FAILED, NOT_TRIED = "passed", "failed", "not_tried"
-REMOTE, ESTOP, SILENCE, TURNS = "remote_control", "emergency_stop", "silence", "steering_at_a_stand"
+REMOTE, ESTOP = "remote_control", "emergency_stop"
+SILENCE, TURNS = "way_to_fall_silent", "steering_at_a_stand"
 EXAMPLE = examples("python -m edge_runtime jog --config edge.toml --out jog.json")
 Condition = Callable[[Any], Any]  # of a report
 Ask = Callable[[str, str], None]
@@ -257,7 +258,10 @@ def walk(jog: Jog, rows: List[Dict[str, str]]) -> None:
     over = ""
     for name, needs, moves, expected, do in STEPS:
         lacks = [need.replace("_", " ") for need in needs if need not in jog.has]
-        result, measured = NOT_TRIED, over or ", ".join(f"the driver knows no {it}" for it in lacks)
+        result, measured = (
+            NOT_TRIED,
+            over or ", ".join(f"the driver knows of no {it}" for it in lacks),
+        )
         if not measured:
             try:
                 jog.ask(name, f"what moves: {moves}")
