@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import itertools
 import json
 import os
@@ -107,7 +108,13 @@ def _rearm(arguments: argparse.Namespace) -> int:
     tls = tls_for(arguments.tls, check_endpoint(arguments.connect))
     if tls is not None:
         check_name(tls.name, common_name(OPERATOR, arguments.vehicle_id))
-    reply = ask(arguments.connect, arguments.vehicle_id, "rearm", tls)
+    answer = partial(ask, arguments.connect, arguments.vehicle_id, tls=tls)
+    stop = "none seen"  # late, a re-arm is for no other
+    with contextlib.suppress(UserError):  # the second question tells why
+        seen = answer("status")
+        newest = seen["command"] or {}
+        stop = f"{newest.get('session')}/{newest.get('episode')}/{seen['safe_stops']}"
+    reply = answer("rearm", payload=stop)
     if not reply["accepted"]:
         raise UserError(f"{arguments.vehicle_id} was not re-armed: {reply['detail']}")
     print(f"{arguments.vehicle_id} is re-armed; it drives once 5 states in a row were fresh")

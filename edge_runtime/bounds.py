@@ -40,7 +40,7 @@ def check_bounds(bounds: Bounds, model: Model, vehicle: str) -> None:
         asked, most = getattr(bounds, name), getattr(model, name)
         if most < asked < math.inf:
             raise UserError(f"[vehicle] {name} {asked:g} is above the limit of {vehicle}: {most:g}")
-    if bounds.max_steering_rad < math.inf == model.full_steering_rad:
+    if bounds.max_steering_rad < math.inf and not 0.0 < model.full_steering_rad < math.inf:
         words = f"[vehicle] max_steering_rad: the driver {vehicle} does not know its angle"
         raise UserError(f"{words}; leave it out, or set the driver's `model`")
 
@@ -50,15 +50,14 @@ def narrowed(limits: Limits, bounds: Bounds, model: Model) -> Limits:
 
     The angle grows at least in proportion to the action, so none within is above the cap.
     """
-    share = bounds.max_steering_rad / model.full_steering_rad  # NaN where neither is known
-    if STEERING not in limits or not share < 1.0:
+    if STEERING not in limits or not bounds.max_steering_rad < model.full_steering_rad:
         return limits
-    row = limits[STEERING]
+    row, share = limits[STEERING], bounds.max_steering_rad / model.full_steering_rad
     return {**limits, STEERING: row._replace(low=row.low * share, high=row.high * share)}
 
 
 class Leash:
-    """The distance by odometry since the last re-arm; both directions count."""
+    """The distance since the last re-arm, by the speeds noted; both directions count."""
 
     def __init__(self, length_m: float) -> None:
         self._length_m, self._gone_m = length_m, 0.0

@@ -332,8 +332,11 @@ class Controller:
             due += [self._ride.due_s] if self._ride else []
         return min(due) if due else None
 
-    def rearm(self, now_s: float) -> str:
-        """Take an operator's permission to drive again; returns why it is refused, or ""."""
+    def rearm(self, now_s: float, stop: str = "") -> str:
+        """Take an operator's permission to drive again; returns why it is refused, or "".
+
+        `stop` is SESSION/EPISODE/SAFE_STOPS that the operator saw; a late one is for no other.
+        """
         if self.safety.mode is not Mode.SAFE_STOP:
             return f"nothing to re-arm: the mode is {self.safety.mode.value}"
         if self._policy_is_dead:
@@ -346,6 +349,10 @@ class Controller:
             # Kept for later, the permission would move the vehicle when the link returns.
             arrives = "only late" if self._is_late else "no fresh"
             return f"{arrives} states arrive; re-arm when the link is back"
+        assert self._newest is not None  # else it were silent
+        now = self._newest.state
+        if stop not in ("", f"{now.session}/{now.episode}/{self.safety.safe_stops}"):
+            return "this is another stop than was seen; re-arm again"
         self.leash_is_used = False
         self._apply(Event.REARM)
         self.safety = self.safety._replace(permitted_s=now_s)

@@ -268,7 +268,7 @@ def walk(jog: Jog, rows: List[Dict[str, str]]) -> None:
                 measured = do(jog, name)
                 jog.stop()
                 result = PASSED
-            except (Exception, KeyboardInterrupt) as error:  # a driver raises anything
+            except BaseException as error:  # a driver raises anything, and exits
                 close_in_time(jog.vehicle)
                 result, measured = FAILED, str(UserError(str(error) or type(error).__name__))
                 over = f"{name} was not as expected"

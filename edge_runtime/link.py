@@ -70,7 +70,7 @@ class Link:
         self,
         on_state: Callable[[bytes], None],
         health: Callable[[], Health],
-        rearm: Callable[[], str],
+        rearm: Callable[[str], str],
         max_state_bytes: int,
     ) -> None:
         """Listen to states and answer queries. Call `appear` next, when it can answer."""
@@ -89,7 +89,7 @@ class Link:
             # `phil/**` asks what is there: a look at everything is no permission to move.
             if str(query.key_expr) != rearm_key:
                 return
-            refusal = rearm()
+            refusal = rearm(bytes(query.payload or b"").decode(errors="replace"))
             _reply(query, {"accepted": not refusal, "detail": refusal, "mode": health().mode})
 
         session, state_key = self._session, key(self.vehicle_id, "state")
@@ -277,12 +277,16 @@ def _ask(open_client: OpenClient, selector: str) -> List[str]:
 
 
 def ask(
-    connect: str, vehicle_id: str, topic: str, tls: Optional[TlsFiles] = None
+    connect: str,
+    vehicle_id: str,
+    topic: str,
+    tls: Optional[TlsFiles] = None,
+    payload: Optional[str] = None,
 ) -> Dict[str, Any]:
     """Query a runtime's "status" or "rearm" for its JSON; UserError where none comes in 2 s."""
     selector = key(vehicle_id, topic)
     with open_session(connect=connect, mode="client", tls=tls) as session:
-        for reply in session.get(selector, timeout=2.0):
+        for reply in session.get(selector, timeout=2.0, payload=payload):
             if reply.ok is not None:
                 return parse_json(bytes(reply.ok.payload), f"the answer of {vehicle_id}")
     # A query without the right to it looks the same from here as a runtime that is not there.

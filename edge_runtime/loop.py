@@ -227,13 +227,13 @@ class ControlLoop:
         with self._lock:
             self._timer.notify()
 
-    def _rearm(self) -> str:
+    def _rearm(self, stop: str = "") -> str:
         with self._lock:
             now_s = time.monotonic()
             if self._vehicle is not None:
                 # A fault whose cause is over ends with `enable`; the next look shows it.
                 self._controller.vehicle_fault = self._vehicle.standing_fault(now_s)
-            refusal = self._controller.rearm(now_s)
+            refusal = self._controller.rearm(now_s, stop)
             if not refusal and self._vehicle is not None:
                 self._vehicle.enable()
             log.event("info", "rearm", accepted=not refusal, detail=refusal)

@@ -21,7 +21,7 @@ from edge_runtime.policy import VERIFIED, Policy, load_policy
 from edge_runtime.reach import Listener, why_no_link
 from edge_runtime.tls import EDGE, TlsFiles, check_name, common_name, load_tls, rules_for_edge
 from edge_runtime.transport import open_session, rearm_command
-from edge_runtime.util import PathLike, ends_within, printable
+from edge_runtime.util import PathLike, UserError, ends_within, printable
 from edge_runtime.vehicles import check_driver, find_vehicle, make_vehicle
 from edge_runtime.vehicles.base import Vehicle, VehicleRunner, close_in_time
 
@@ -107,6 +107,8 @@ class _Runtime:
             unbuilt.callback(close_in_time, vehicle)
         if vehicle is not None:
             vehicle.take_bounds(config.bounds)
+            if vehicle.allowed != config.bounds:  # nobody would hold it on its leash
+                raise UserError(f"vehicle {vehicle.name}: its take_bounds must call Vehicle's own")
         controller = _controller(config, self._policy, vehicle)
         # Both sessions hear only what this vehicle's edge may hear.
         access = None if self._tls is None else rules_for_edge(config.vehicle_id)

@@ -32,6 +32,7 @@ SOURCE_FAILED = 1  # exit status
 # A camera's noise changes each picture: one that stays is frozen, or the lens is covered.
 FROZEN_PERIODS = 5
 GIVES_UP_S = 2.0  # so long without a state, and the command ends: the vehicle stopped long ago
+TELLS_S = 10.0
 ROUNDING_S = 1e-9
 _POLL_S = 0.1  # a signal that another thread got wakes nobody: so it polls
 
@@ -191,7 +192,9 @@ def run(arguments: argparse.Namespace) -> int:
     with sigterm_as_interrupt(), opened as end:
         try:
             source = _Source(make, task)
-            source.answer()  # The first one is not sent: a camera takes its time to open.
+            # The first one is not sent: a camera takes its time to open.
+            while source.answer(time.monotonic() + TELLS_S) is None:
+                print(f"waiting: {asked.source} has observed nothing yet", flush=True)
             print(f"ready vehicle_id={vehicle_id} source={asked.source}", flush=True)
             _sense(source, end, task)
         except SourceError as error:

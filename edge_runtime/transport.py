@@ -224,10 +224,11 @@ def pasted(
 ) -> str:
     """Return a command for another shell of this machine, as that role.
 
-    Loopback stands for an endpoint that listens at every address. Certificates are looked for
-    beside `tls`, our own, and else are where `deploy certs` makes them.
+    Loopback stands for an endpoint that listens at every address; over TLS Zenoh connects to no
+    `[::1]`. Certificates are looked for beside `tls`, our own, and else are where `deploy certs`
+    makes them.
     """
-    place = endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
+    place = endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/localhost:")
     given = ["--connect", place, "--vehicle-id", vehicle_id]
     if tls is not None:
         name = common_name(role, vehicle_id)

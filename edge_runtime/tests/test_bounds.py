@@ -9,7 +9,7 @@ from hil_tests.tests.shared.policies import T
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edge_runtime.bounds import Bounds, Leash, narrowed
+from edge_runtime.bounds import NO_BOUNDS, Bounds, Leash, Model, narrowed
 from edge_runtime.tests.rigs import (
     CARS,
     SPEC,
@@ -48,6 +48,15 @@ def test_an_angle_that_a_driver_does_not_know_is_not_capped():
     vehicle.take_bounds(Bounds(max_speed_mps=0.5))
     with pytest.raises(UserError, match="max_steering_rad"):
         vehicle.take_bounds(Bounds(max_steering_rad=0.1))
+
+
+@pytest.mark.parametrize("full_rad", [0.0, -0.4, math.nan])
+def test_an_angle_that_is_none_is_not_known(full_rad):
+    vehicle, model = BrokenVehicle(), Model(6.0, 0.4, full_rad)
+    vehicle.model_limits = model
+    with pytest.raises(UserError, match="max_steering_rad"):
+        vehicle.take_bounds(Bounds(max_steering_rad=0.1))
+    assert narrowed(vehicle.limits, NO_BOUNDS, model) == vehicle.limits
 
 
 @pytest.mark.parametrize("make", [HunterRig, Ros2Rig, MockRig])

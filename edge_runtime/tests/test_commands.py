@@ -184,6 +184,27 @@ def test_an_answer_that_is_no_json_or_none_is_one_line(topic, refuses):
         refuses([topic, "--connect", endpoint], "JSON")
 
 
+@pytest.mark.parametrize(
+    ("command", "stop"),
+    [({"session": "a", "episode": 2}, "a/2/0"), (None, "None/None/0"), (b"[", "none seen")],
+)
+def test_a_re_arm_is_for_the_stop_that_is_seen_when_it_is_typed(command, stop, capsys):
+    endpoint, asked = free_endpoint(), []
+    status, rearm = ("phil/hunter01/status", "phil/hunter01/rearm")
+    bad = command if isinstance(command, bytes) else b""
+    reply = bad or json.dumps(a_status(command=command)).encode()
+
+    def answer(query):
+        asked.append(bytes(query.payload).decode())
+        query.reply(rearm, b'{"accepted": true}')
+
+    with open_session(listen=endpoint, mode="router") as session:
+        session.declare_queryable(status, lambda query: query.reply(status, reply))
+        session.declare_queryable(rearm, answer)
+        assert exit_status(main, ["rearm", "--connect", endpoint]) == 0
+    assert asked == [stop]
+
+
 def a_status(**changes):
     action = [{"name": "pedal"}, {"name": "steering"}]
     about = {"manifest": {"action": action, "task": "t"}, "command": None, "feedback": None}

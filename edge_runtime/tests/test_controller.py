@@ -508,6 +508,15 @@ def test_with_a_permission_for_each_episode(story):
     assert (controller.safety.safe_stops, controller.waits_for_rearm) == (safe_stops, waits)
 
 
+def test_a_re_arm_that_names_its_stop_is_for_no_other():
+    controller = play(make(needs_rearm=True, each_episode=True), [*STOPPED, (0.5, "state", SILENT)])
+    for other in ("simulator-a/0/0", "simulator-a/1/1", "simulator-b/0/1", "None/None/1"):
+        assert controller.rearm(0.55, other)
+        assert controller.waits_for_rearm
+    assert controller.rearm(0.55, "simulator-a/0/1") == ""
+    assert not controller.waits_for_rearm
+
+
 def test_without_a_vehicle_no_episode_waits():
     rows = [(0.0, "final", "drive"), *states(1.0, 3, "drive")]
     assert play(make(each_episode=True), rows).safety.safe_stops == 0

@@ -171,8 +171,10 @@ def test_only_a_query_by_its_own_name_re_arms(session, link):
     for selector in ("phil/**", "phil/*/rearm", "phil/hunter01/*", "phil/hunter01/re$*"):
         asked["phil/hunter01/rearm"](MagicMock(key_expr=selector))
     assert not rearm.called  # somebody looked at everything that is there
-    asked["phil/hunter01/rearm"](MagicMock(key_expr="phil/hunter01/rearm"))
-    assert rearm.call_count == 1
+    for payload in (None, b"a/0/1\xff"):
+        query = MagicMock(key_expr="phil/hunter01/rearm", payload=payload)
+        asked["phil/hunter01/rearm"](query)
+    assert [call.args for call in rearm.call_args_list] == [("",), ("a/0/1\ufffd",)]
 
 
 def test_the_session_is_closed_whatever_fails(session, link, monkeypatch):

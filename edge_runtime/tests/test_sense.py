@@ -23,7 +23,15 @@ from edge_runtime.manifest import Entry, Layout
 from edge_runtime.policy import load_manifest
 from edge_runtime.reach import free_endpoint
 from edge_runtime.safety import Mode
-from edge_runtime.sense import FROZEN_PERIODS, GIVES_UP_S, Intake, Seen, SourceError, look
+from edge_runtime.sense import (
+    FROZEN_PERIODS,
+    GIVES_UP_S,
+    Intake,
+    Seen,
+    SourceError,
+    _Source,
+    look,
+)
 from edge_runtime.util import UserError
 from edge_runtime.wire import DRIVE, encode
 
@@ -384,6 +392,30 @@ def test_a_source_that_no_longer_answers_in_time_ends_it(word, folder, capsys, m
     found, _, err = call(capsys, *words, *listen, package="edge_runtime")
     assert (found, len(err.splitlines())) == (1, 1)
     assert "too slow" in err
+
+
+def test_an_interrupt_while_a_source_is_imported_is_one(folder, capsys, monkeypatch):
+    (folder / "interrupted.py").write_text("raise KeyboardInterrupt")
+    monkeypatch.syspath_prepend(folder)
+    words = ("--source", "interrupted:Source", "--policy", make_policy(folder), "--allow-unsigned")
+    assert call(capsys, "sense", *words, package="edge_runtime")[0] == 130
+
+
+def test_a_source_that_never_begins_is_waited_for_and_said_to_be(folder, capsys, monkeypatch):
+    answers = iter([None, None])
+
+    def answer(*_):
+        for each in answers:
+            return each
+        raise KeyboardInterrupt
+
+    monkeypatch.syspath_prepend(folder)
+    monkeypatch.delitem(sys.modules, "my_source", raising=False)
+    monkeypatch.setattr(_Source, "answer", answer)
+    words = ("--source", "my_source:Few", "--policy", make_policy(folder), "--allow-unsigned")
+    listen = ("--listen", free_endpoint())
+    status, out, _ = call(capsys, "sense", *words, *listen, package="edge_runtime")
+    assert (status, out.count("waiting")) == (130, 2)
 
 
 def test_a_hanging_source_holds_no_signal(folder):

@@ -1,6 +1,7 @@
 """The runner of a driver that raises, hangs or reports nonsense."""
 
 import contextlib
+import math
 import time
 
 import msgspec
@@ -93,9 +94,11 @@ def test_no_driver_is_given_more_than_the_bounds(vehicle):
         assert [*given[-1].values()] == pytest.approx(expected)
 
 
-def test_only_enable_gives_a_new_leash(vehicle):
+@pytest.mark.parametrize("speeds", [(-1.0, None), (0.0, 1.0), (0.5, 1.0), (-1.0, math.nan)])
+def test_only_enable_gives_a_new_leash(vehicle, speeds):
+    """Odometry that says too little is not believed, where the driver tells what is asked."""
     vehicle.take_bounds(Bounds(leash_m=0.3))
-    vehicle.odd = {"speed_mps": -1.0}
+    vehicle.odd = dict(zip(("speed_mps", "commanded_speed_mps"), speeds))
     runner = NotingRunner(vehicle)
     runner.start(armed=False)
     with contextlib.closing(runner):

@@ -170,6 +170,20 @@ def test_drive_from_python_moves_a_driver_until_it_is_told_to_end(make_policy):
     assert "close" in vehicle.asked
 
 
+def test_a_driver_that_keeps_the_bounds_for_itself_is_refused(make_policy):
+    class Loose(BrokenVehicle):
+        def take_bounds(self, bounds):
+            self.most_mps = bounds.max_speed_mps
+
+    signed, vehicle = make_policy(), Loose()
+    key, connect = str(signed.public_key), free_endpoint()
+    with pytest.raises(UserError, match="take_bounds"):
+        edge_runtime.drive(
+            signed.path, connect=connect, vehicle=vehicle, leash_m=1.0, public_key=key
+        )
+    assert vehicle.asked == ["close"]
+
+
 @pytest.mark.parametrize(
     ("settings", "words"),
     [

@@ -70,6 +70,8 @@ class Pictures(Stacked):
         opened = map(Image.open, sorted(FOLDER.iterdir()))
         self.pictures = [np.asarray(each.convert("L").resize((WIDTH, HEIGHT))) for each in opened]
         self.count = -1
+        if not self.pictures:
+            raise OSError(f"there is no picture in {FOLDER}")
 
     def take(self) -> np.ndarray:
         self.count += 1

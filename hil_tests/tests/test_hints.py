@@ -24,10 +24,10 @@ def said_after(process, text):
     return next(line.partition(text)[2] for _, line in process.lines if text in line)
 
 
-@pytest.mark.parametrize("endpoint", ["tcp/0.0.0.0:7449", "tcp/[::]:7449", "tcp/10.0.0.2:7449"])
+@pytest.mark.parametrize("endpoint", ["tcp/0.0.0.0:7449", "tls/[::]:7449", "tcp/10.0.0.2:7449"])
 def test_a_printed_address_is_one_that_the_reader_can_reach(endpoint):
     words = rearm_command(endpoint, "car-a")
-    reached = endpoint.replace("0.0.0.0", "127.0.0.1").replace("[::]", "[::1]")
+    reached = endpoint.replace("0.0.0.0", "127.0.0.1").replace("[::]", "localhost")
     assert shlex.split(words) == [
         "python", "-m", "edge_runtime", "rearm", "--connect", reached, "--vehicle-id", "car-a",
     ]  # fmt: skip

@@ -68,3 +68,9 @@ def test_a_folder_of_pictures_stands_in_for_it(my_camera):
     assert {(each.shape, str(each.dtype)) for each in seen} == {((2, 45, 80), "uint8")}
     assert (seen[3][1] == seen[0][1]).all()  # from the beginning again
     assert (seen[1] != seen[2]).any()
+
+
+def test_a_folder_without_pictures_says_so(my_camera):
+    my_camera.FOLDER.mkdir()
+    with pytest.raises(OSError, match="no picture"):
+        my_camera.Pictures()

@@ -339,10 +339,11 @@ def test_only_two_angles_let_the_ros_2_driver_steer_at_a_stand(angular):
         assert vehicle.steers_at_a_stand == (angular == "steering")
 
 
-def test_a_driver_that_raises_is_a_step_that_failed():
+@pytest.mark.parametrize("error", [OSError("gone"), SystemExit("gone")])
+def test_a_driver_that_raises_is_a_step_that_failed(error):
     vehicle = BrokenVehicle()
     rows: list[dict[str, str]] = []
-    vehicle.raises["feedback"] = OSError("gone")
+    vehicle.raises["feedback"] = error
     jog.walk(jog.Jog(vehicle, NO_BOUNDS, lambda *words: None), rows)
     assert (rows[0]["result"], rows[0]["measured"]) == ("failed", "gone")
     assert vehicle.asked[-1] == "close"
