@@ -43,8 +43,6 @@ class Decision:
 
 
 class CommandHold:
-    """The newest command of one episode, and its age; ``period_s`` is T."""
-
     def __init__(self, now_s: float, period_s: float) -> None:
         self._period_s, self._silence_s = period_s, BRAKE_PERIODS * period_s
         self.newest: Command | None = None

@@ -289,8 +289,6 @@ Message = TypeVar("Message")
 
 @dataclass(frozen=True)
 class Arrival(Generic[Message]):
-    """A state that has reached the edge runtime."""
-
     step: int
     arrived_s: float
     message: Message

@@ -195,7 +195,8 @@ class Shadow:
     def report(self) -> dict[str, Any]:
         """Return the report; None stands where there is nothing to tell a number of."""
         names = [row.name for row in self._policy.manifest.action]
-        rows, disagreement = np.array(self._compared).reshape(-1, len(names)), {}
+        rows: Any = np.array(self._compared).reshape(-1, len(names))
+        disagreement = {}
         for name, values in zip(names, rows.T, strict=True):
             mean = float(values.mean()) if len(rows) else None
             disagreement[name] = {"mean": mean, **percentiles(values, p95=95, max=100)}

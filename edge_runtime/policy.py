@@ -375,7 +375,6 @@ def _fields(message: Any) -> dict[int, Any]:
 
 
 def _varint(message: memoryview, position: int) -> tuple[int, int]:
-    """Read a number; returns it and where it ends."""
     result = 0
     for index, byte in enumerate(message[position : position + 10]):
         result |= (byte & 0x7F) << (7 * index)

@@ -225,8 +225,7 @@ def pasted(
     """Return a command for another shell of this machine, as that role.
 
     Loopback stands for an endpoint that listens at every address; over TLS Zenoh connects to no
-    `[::1]`. Certificates are looked for beside `tls`, our own, and else are where `deploy certs`
-    makes them.
+    `[::1]`. Certificates lie beside `tls`, our own, or else where `deploy certs` makes them.
     """
     place = endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/localhost:")
     given = ["--connect", place, "--vehicle-id", vehicle_id]

@@ -123,7 +123,6 @@ class Bench:
         return self.until(moves=False) and self.goes()
 
     def waits(self) -> bool:
-        """Return whether it stands after `enable`, until a command comes."""
         self.call("enable")
         return not self.until(moves=True, limit_s=0.5)
 
@@ -133,7 +132,6 @@ class Bench:
         return bool(self.report(periods * self.period_s).self_braking)
 
     def brakes(self) -> bool:
-        """Return whether it gets slower within 2 T of a stop, and then stands."""
         self.call("brake")
         # Commands still come: without them it would brake by itself.
         if self.until(moves=False, limit_s=2 * self.period_s + LATE_S, commands=True):

@@ -112,7 +112,6 @@ def open_sink(
 
 
 def flush(recording: rr.RecordingStream) -> None:
-    """Wait until all that was drawn has arrived; ViewerGone where it does not."""
     try:
         recording.flush(timeout_sec=FLUSH_S)
     except RuntimeError as error:

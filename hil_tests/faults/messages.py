@@ -45,7 +45,6 @@ def bad_states(rig: Rig) -> Try:
 
 
 def _bad_of(step: int, task: Task) -> Iterable[tuple[str, bytes]]:
-    """Yield (reason, payload) of states that must be rejected, around the newest step."""
     state, (name, *_) = noisy_state(step + 1, task), task.observation
     large, small = ({**state.observation, name: bytes(n)} for n in (wire.MAX_PAYLOAD_BYTES, 3))
     valid = encode(state)

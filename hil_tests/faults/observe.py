@@ -109,7 +109,6 @@ def later_s(task: Task) -> float:
 
 
 def longest_gap_s(times_s: Iterable[float], begin_s: float, end_s: float) -> float:
-    """Return the longest stretch within [begin, end] without an event, s."""
     inside = [begin_s, *sorted(t for t in times_s if begin_s < t < end_s), end_s]
     return max(after - before for before, after in pairwise(inside))
 
@@ -240,7 +239,6 @@ class CanMonitor(can.Listener):
         self._notifier = can.Notifier(self._bus, [self], timeout=0.1)
 
     def of(self, can_id: int, since_s: float = -math.inf) -> list[tuple[float, bytes]]:
-        """Return times and data of the frames of an identifier since a moment, in order."""
         return [(s, data) for s, heard_id, data in self.heard if heard_id == can_id and s > since_s]
 
     def close(self) -> None:

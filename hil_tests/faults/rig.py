@@ -207,7 +207,6 @@ class Rig:
         return found
 
     def last_drive_s(self) -> float:
-        """Return when the newest drive command came; -inf before the first."""
         times = (c.seen_s for c in reversed(self.timeline.commands) if c.mode == DRIVE)
         return next(times, float("-inf"))
 
