@@ -186,7 +186,8 @@ def run(arguments: argparse.Namespace) -> int:
     tls = transport.tls_for(asked.tls, asked.connect or asked.listen)
     manifest = load_manifest(asked.policy, asked.public_key, asked.allow_unsigned)
     task = Task(**{name: getattr(manifest, name) for name in Task.__struct_fields__})
-    make = load_named(asked.source, "source")
+    with sigterm_as_interrupt():  # and so afterwards, whatever the import does to signals
+        make = load_named(asked.source, "source")
     place = (asked.listen, vehicle_id, tls, asked.connect)
     opened = transport.open_simulator(transport.SimulatorEnd, *place)
     with sigterm_as_interrupt(), opened as end:

@@ -401,6 +401,18 @@ def test_an_interrupt_while_a_source_is_imported_is_one(folder, capsys, monkeypa
     assert call(capsys, "sense", *words, package="edge_runtime")[0] == 130
 
 
+def test_a_source_that_is_imported_takes_no_signal_away(folder, capsys, monkeypatch):
+    (folder / "deaf.py").write_text("import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)")
+    monkeypatch.syspath_prepend(folder)
+    before = signal.getsignal(signal.SIGINT)
+    words = ("--source", "deaf:Source", "--policy", make_policy(folder), "--allow-unsigned")
+    try:
+        assert call(capsys, "sense", *words, package="edge_runtime")[0] == 2  # there is no Source
+        assert signal.getsignal(signal.SIGINT) == before
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def test_a_source_that_never_begins_is_waited_for_and_said_to_be(folder, capsys, monkeypatch):
     answers = iter([None, None])
 
