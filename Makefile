@@ -36,7 +36,7 @@ test-ray: $(STAMP)  ## experiments on a local Ray cluster of several nodes
 	$(BIN)/python -m pip install --quiet --constraint requirements/workstation.txt --editable '.[ray]'
 	$(BIN)/python -m pytest -m ray trainer
 
-test-board: $(STAMP)  ## whole bundles installed, with every fault, and the camera's tutorial; minutes, root
+test-board: $(STAMP)  ## whole bundles installed, with every fault, and the tutorials that train; minutes, root
 	$(BIN)/python -m pytest -m board
 
 lint: $(STAMP)  ## ruff, mypy, and what the board's Python 3.8 would refuse

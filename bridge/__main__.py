@@ -9,10 +9,7 @@ from edge_runtime.cli import program, run_cli
 
 COMMANDS = {
     "simulate": ("bridge.simulate", "serve an environment to an edge runtime"),
-    "sense": (
-        "bridge.ports:sense",
-        "serve a robot's own senses to an edge runtime, not a simulator's",
-    ),
+    "sense": ("bridge.ports:sense", "serve a robot's own senses, not a simulator's"),
     "router": ("bridge.ports:router", "connect simulators, edge runtimes and viewers"),
     "record": ("bridge.ports:record", "write everything on the wire to an MCAP recording"),
     "replay": ("bridge.replay", "run recorded states through a policy, and compare"),

@@ -1,12 +1,10 @@
 """The clocks: each carries one tick's state out and brings the vehicle's decision back.
 
-In lock-step latency passes in virtual time (`VirtualLink`): states are published in their virtual
-order of arrival, and each real answer is awaited before it goes its virtual way back. Computing
-takes no virtual time, so the same seed gives the same run on a fast and a slow machine.
+In lock-step latency passes in virtual time (`VirtualLink`), and each real answer is awaited.
+Computing takes no virtual time, so one seed gives one run on a fast and a slow machine.
 
-Real time has absolute ticks on the monotonic clock and waits for no answer. Tick n begins at n T
-after the episode's start; its state goes out through the delay line, and the vehicle acts at the
-latest T / 4 after the tick on the newest command that has arrived. With a vehicle in the loop
+Real time has absolute ticks on the monotonic clock and waits for no answer. The vehicle acts at the
+latest T / 4 after a tick on the newest command that has arrived. With a vehicle in the loop
 (`VehicleClock`), its newest feedback at tick n + 1 says what came of state n.
 """
 
@@ -41,10 +39,7 @@ STANDSTILL_WAIT_S = 5.0
 
 @dataclass(eq=False)
 class _Clock:
-    """Drives the exchange of one episode at a time: ``begin``, ``exchange`` ..., ``finish``.
-
-    ``begin`` takes the seed of the network's delays and losses.
-    """
+    """Drives the exchange of one episode at a time: ``begin``, ``exchange`` ..., ``finish``."""
 
     publish: Publish
     check: inbound.CommandCheck
@@ -66,7 +61,6 @@ class _Clock:
         self._arrived = threading.Condition()
 
     def rejected(self) -> Counter[str]:
-        """Return what was not believed so far, by reason; of feedback as ``feedback_REASON``."""
         return Counter(dict(self.check.rejected))  # Another thread may go on counting
 
     def newest_answer(self) -> tuple[int, float] | None:
@@ -90,7 +84,7 @@ class _Clock:
 
 
 class LockStepClock(_Clock):
-    """The clock of ``--clock lockstep``. One thread runs it; Zenoh's only fills the inbox."""
+    """One thread runs it; Zenoh's only fills the inbox."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -161,10 +155,7 @@ class LockStepClock(_Clock):
 
 
 class RealTimeClock(_Clock):
-    """The clock of ``--clock realtime``.
-
-    The caller's thread runs the ticks, Zenoh's hands in commands, the delay line's delivers both.
-    """
+    """The caller's thread runs the ticks, Zenoh's hands in commands, a delay line delivers both."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -217,9 +208,9 @@ class RealTimeClock(_Clock):
             self._line.push(self._begun_s + arrival_s, partial(deliver, payload))
 
     def _wait_for_tick(self, step: int) -> float:
-        """Sleep until the tick and return its time; a tick missed altogether moves all later ones.
+        """Sleep until the tick and return its time; a missed one moves all later ones.
 
-        Catching up instead would run several ticks at once, at a pace no edge runtime can follow.
+        No edge runtime could follow several ticks at once.
         """
         tick_s = self._start_s + step * self._period_s
         late_s = time.monotonic() - tick_s
@@ -302,10 +293,9 @@ class VehicleClock(RealTimeClock):
 
 
 class DelayLine:
-    """Runs actions at their time on the monotonic clock, on a thread of its own.
+    """Runs actions at their time (monotonic), on a thread that ``close`` ends.
 
-    ``close`` ends the thread. What an action raises ends the line, and is raised by the next
-    ``push`` or ``close``.
+    What an action raises ends the line, and is raised by the next ``push`` or ``close``.
     """
 
     def __init__(self) -> None:

@@ -1,9 +1,7 @@
 """Environments: found by name, described for a policy file, and adapted to a task.
 
-The bridge knows environments only by name, and imports nothing of the trainer: a scenario's word is
-an entry point of the group ``phil.scenarios``, whose value is a gymnasium id in a module that
-registers it. Everything beyond gymnasium's own interface is optional and found by name on the
-environment or one of its wrappers; docs/own_environment.md lists it.
+The bridge knows them only by name. Everything beyond gymnasium's own interface is optional, and
+found by name on the environment or one of its wrappers (docs/own_environment.md).
 """
 
 from __future__ import annotations
@@ -54,12 +52,10 @@ def scenarios() -> dict[str, str]:
 
 
 def make_environment(name: str, condition: str = NOMINAL) -> Environment:
-    """Make the environment of a scenario word, a gymnasium id or ``module:id``.
+    """Make the environment of a scenario word, a gymnasium id or ``module:id``; UserError.
 
     Another condition than the nominal one is passed as the keyword ``scene``, and
     ``render_mode="rgb_array"`` to a constructor that takes it.
-
-    Raises UserError for an unknown name, or a module that does not import.
     """
     level, gymnasium.logger.min_level = gymnasium.logger.min_level, gymnasium.logger.ERROR
     try:
@@ -110,11 +106,7 @@ class _OneLine(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 def _register(environment_id: str) -> None:
-    """Let installed packages register an id that is not known yet.
-
-    It may be that of a scenario, or one of a package that registers its ids by an entry point for
-    Gymnasium, as highway-env does.
-    """
+    """Let installed scenarios, and Gymnasium's plug-ins such as highway-env, register their ids."""
     if ":" in environment_id or environment_id in gymnasium.registry:
         return
     for scenario in importlib.metadata.entry_points(group=SCENARIO_GROUP):
@@ -129,13 +121,11 @@ def _register(environment_id: str) -> None:
 def describe(
     environment: Environment, period_s: float | None = None, unknown_s: float | None = None
 ) -> Task:
-    """Return what the environment asks of a policy: its observation, actions, and control period.
+    """Return the observation, the actions and the control period of an environment.
 
     The period is ``period_s`` where given, else the environment's ``control_period_s``, that of
     ``config["policy_frequency"]`` (highway-env's), ``dt``, a guess from ``render_fps``, or
-    ``unknown_s``. A line says where one of the last two is taken.
-
-    Raises UserError where the wire cannot carry it, or where nothing says how long a step is.
+    ``unknown_s``; a line tells of the last two. UserError where the wire cannot carry it.
     """
     name = offered(environment, "scenario") or name_of(environment)
     try:
@@ -248,7 +238,6 @@ def finite(name: str, value: Any) -> float:
 
 
 def scene_of(environment: Environment) -> dict[str, Any] | None:
-    """Return the scene from above, for viewers only; None if the environment has none."""
     scene = offered(environment, "scene")
     return scene() if callable(scene) else None
 
@@ -268,10 +257,9 @@ def picture_of(environment: Environment) -> bytes:
 
 
 class Adapter:
-    """An environment that is driven as a task says: observations in, actions out, and its brake.
+    """An environment that is driven as a task says.
 
-    The task's actions may be the policy's, with their safe stops; the environment's own
-    ``brake_action`` and ``press_brake`` come before those.
+    Its own ``brake_action`` and ``press_brake`` come before the safe stops of the task's actions.
     """
 
     def __init__(self, env: Environment, task: Task) -> None:
@@ -283,15 +271,12 @@ class Adapter:
         self.last = self.hands_off
 
     def arrays(self, observation: Any) -> dict[str, np.ndarray]:
-        """Return an observation's entries as the task has them, as `arrays_of` does."""
         return arrays_of(self.task, observation)
 
     def pack(self, observation: Any) -> dict[str, bytes]:
-        """Return an observation as a state carries it."""
         return {name: array.tobytes() for name, array in self.arrays(observation).items()}
 
     def within(self, action: Any) -> np.ndarray:
-        """Return the numbers as an action of the environment, within its range."""
         values = np.asarray(action, self._space.dtype).reshape(self._space.shape)
         self.last = np.clip(values, self._space.low, self._space.high)
         return self.last
@@ -303,17 +288,13 @@ class Adapter:
         return self.within([last if row.stop is None else row.stop for row, last in pairs])
 
     def press_brake(self, pressed: bool) -> None:
-        """Press or release the brake of an environment that has one: its action only steers."""
         press = offered(self.env, "press_brake")
         if callable(press):
             press(pressed)
 
 
 def arrays_of(task: Task, observation: Any) -> dict[str, np.ndarray]:
-    """Return an observation's entries as the task has them.
-
-    Raises UserError for another shape, or where a number would change.
-    """
+    """Return the task's entries; UserError for another shape, or where a number would change."""
     if not isinstance(observation, Mapping):
         observation = {next(iter(task.observation)): observation}
     return {name: _fitting(observation, name, entry) for name, entry in task.observation.items()}

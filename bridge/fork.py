@@ -1,10 +1,8 @@
 """``python -m bridge fork``: rebuild a recorded drive up to a moment, and drive on in another way.
 
-The scene is rebuilt from its seed and from the action of every step; each observation is compared
-with the recorded one, to the bit. From there it is an ordinary drive in lock-step, with a policy
-inside the edge runtime's decision logic in this process.
-
-A person forks a drive in the trainer: the bridge imports nothing of it, and runs its command.
+The scene is rebuilt from its seed and all actions, and each observation compared, to the bit. From
+there it is an ordinary drive in lock-step, with a policy in this process. A person drives on in the
+trainer, whose command is run.
 """
 
 from __future__ import annotations
@@ -69,7 +67,6 @@ class RecordedEpisode:
 
     @property
     def steps(self) -> int:
-        """How many steps from the first on have a recorded action."""
         return next(n for n in range(len(self.applied) + 1) if n not in self.applied)
 
     def step_at(self, at_s: float) -> int:

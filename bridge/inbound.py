@@ -1,9 +1,7 @@
 """The vehicle's side of the safety rules: what the simulator believes, holds and brakes for. Pure.
 
-`CommandCheck` and `FeedbackCheck` read what comes back over the wire, and count by reason what is
-not believed. `CommandHold` is the contract's rule on every clock: the newest command
-is held from tick to tick; when none has arrived for 2 T, or when the command itself says
-``safe_stop``, the vehicle brakes.
+`CommandCheck` and `FeedbackCheck` count by reason what is not believed. `CommandHold` holds the
+newest command from tick to tick, and brakes 2 T after it, or where it says ``safe_stop``.
 """
 
 from __future__ import annotations
@@ -45,8 +43,6 @@ class Decision:
 
 
 class CommandHold:
-    """The newest command of one episode, and its age; ``period_s`` is T."""
-
     def __init__(self, now_s: float, period_s: float) -> None:
         self._period_s, self._silence_s = period_s, BRAKE_PERIODS * period_s
         self.newest: Command | None = None
@@ -60,9 +56,8 @@ class CommandHold:
     def admit(self, command: Command, now_s: float) -> bool:
         """Take the command if it is newer than the newest one; return whether it was taken.
 
-        An edge runtime in safe stop repeats its answer to the last state it heard at rate 1/T;
-        such a repetition is as good a heartbeat as a new answer. A repeated ``drive`` is not: it
-        would keep a frozen controller alive.
+        In a safe stop the repeated answer to the last state is a heartbeat, too. A repeated
+        ``drive`` is not: it would keep a frozen controller alive.
         """
         repeats_stop = command.step == self.newest_step and command.mode == SAFE_STOP
         if command.step <= self.newest_step and not repeats_stop:
@@ -71,10 +66,7 @@ class CommandHold:
         return True
 
     def decide(self, now_s: float, edge_silent: bool = False) -> Decision:
-        """Decide this tick.
-
-        ``edge_silent``: lock-step has waited in vain; virtual time stood still meanwhile.
-        """
+        """Decide this tick; ``edge_silent``: lock-step has waited in vain, in wall time."""
         brake_reason, command, ridden = "", self.newest, 0
         plan = command.plan or [] if command is not None and command.mode == DRIVE else []
         silent_s = now_s - self._heard_s
@@ -92,10 +84,9 @@ class CommandHold:
 
 
 class CommandCheck:
-    """Reads commands for one simulator session and keeps the counts of the whole run.
+    """Reads the commands of one session, under the clock's lock; counts are of the whole run.
 
     ``policy_ids`` holds the policies that answered, each once, in order of appearance.
-    Used by one thread at a time, under the clock's lock.
     """
 
     def __init__(self, session: str, task: Task) -> None:
@@ -110,11 +101,9 @@ class CommandCheck:
         """The next state's fields about this session's commands; empty before the first."""
 
     def begin(self, episode: int) -> None:
-        """Begin an episode: answers to earlier ones come too late from now on."""
         self.newest, self._is_over = (episode, -1), False
 
     def sent(self, step: int) -> None:
-        """Note a state sent, so that its answer can be told from an invention."""
         self.newest = (self.newest[0], step)
 
     def end(self, final_step: int) -> None:
@@ -179,9 +168,8 @@ def _action_fault(
 class FeedbackCheck:
     """Reads feedback for the session of ``commands`` and keeps the counts of the whole run.
 
-    Another simulator's session is no fault before the vehicle has heard of this session, but is not
-    believed either. Feedback is ordered by its stamps; after 2 T of silence any stamp is taken:
-    another board, with another clock, may be there.
+    Another simulator's session is no fault until the vehicle has heard of this session. Feedback is
+    in the order of its stamps; after 2 T of silence any stamp is taken, as of another board.
     """
 
     def __init__(self, commands: CommandCheck) -> None:

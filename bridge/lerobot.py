@@ -1,8 +1,7 @@
 """``python -m bridge export``: turn a recording into a LeRobotDataset v3.0, in Parquet and MP4.
 
-A frame is an answered state with the first new answer to it. The format knows no gaps: where nobody
-answered a state, only the feature ``step`` jumps. The file is read once for each array of the
-observation, so that pictures need no memory.
+A frame is an answered state with the first new answer to it; where nobody answered, the feature
+``step`` jumps. The file is read once for each array, so that pictures need no memory.
 """
 
 from __future__ import annotations
@@ -79,10 +78,7 @@ def run(arguments: Any) -> int:
 
 
 def _export(drive: RecordedDrive, folder: Path) -> int:
-    """Write the data set and return its number of frames.
-
-    UserError where the states cannot be read, or none was answered.
-    """
+    """Write the data set and return its number of frames; UserError where no state was answered."""
     task = drive.task
     if task is None:
         raise UserError(f"{drive.recording.path} holds no scene that says how to read the states")
@@ -121,7 +117,6 @@ def _export(drive: RecordedDrive, folder: Path) -> int:
 
 
 def _kept(drive: RecordedDrive, task: Task) -> Iterator[tuple[Layout, State, Command]]:
-    """Yield the readable states with their answers, and how to read them."""
     layout = Layout(task)
     for state in drive.states():
         exchange = None if state.final else drive.answers.get(key_of(state))
@@ -240,7 +235,6 @@ def _write_tables(
 
 
 def _column(values: np.ndarray) -> Any:
-    """Return a column of plain numbers or texts, or of lists of a fixed length."""
     column, size = pa.array(values.ravel()), values.size // len(values)
     return column if size == 1 else pa.FixedSizeListArray.from_arrays(column, size)
 

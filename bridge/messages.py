@@ -1,7 +1,6 @@
 """The messages on the wire as listeners get them: the table of topics, and the scene.
 
-The scene is an extension topic for viewers, ``phil/<vehicle_id>/scene``: the road from above. It
-holds what the environment knows and the vehicle does not, so the policy never hears it.
+The scene is for viewers: the road from above, which the policy never hears of.
 """
 
 from __future__ import annotations
@@ -72,7 +71,6 @@ def body(car: SeenCar) -> list[Point]:
 
 
 def windscreen(car: SeenCar) -> list[Point]:
-    """Return the line that tells front from back."""
     return _line(car, *(complex(0.2 * car.length_m, y * car.width_m) for y in (-0.35, 0.35)))
 
 
@@ -112,11 +110,11 @@ class Origin(msgspec.Struct, frozen=True, kw_only=True):
 class Scene(SeenScene, frozen=True, kw_only=True):
     """The scene on the wire, with its place in time and the simulator's own facts.
 
-    ``task`` says how to read the states. ``picture`` is a JPEG of an environment that has no
-    ``scene()`` and draws itself; empty otherwise. ``applied`` is the action of the step that led
-    here, whoever decided it, ``braked`` whether the brake was pressed in it, and ``ridden`` its
-    place in an earlier command's plan, 0 for none. ``waited`` counts the first steps of the
-    episode, in which the environment stood still: its vehicle waited for a re-arm.
+    ``task`` says how to read the states. ``picture`` is a JPEG where there is no ``scene()``. The
+    step that led here had the action ``applied``, whoever decided it; ``braked``: with the brake
+    pressed; ``ridden``: its place in an earlier command's plan, 0 for none. ``waited`` counts the
+    first steps of the episode, in which the environment stood still: its vehicle waited for a
+    re-arm.
     """
 
     episode: int
@@ -159,15 +157,11 @@ def read_scene(scene: Mapping[str, Any]) -> SeenScene:
 
 
 def is_picture(entry: Entry) -> bool:
-    """Return whether an entry is drawn as a picture: bytes in two dimensions or more."""
     return entry.dtype == "uint8" and len(entry.shape) > 1
 
 
 def images_of(array: np.ndarray) -> np.ndarray | None:
-    """Return an observation's array as images [count, height, width, 1 or 3], or None.
-
-    Bytes in two dimensions or more are images: colour with a last axis of 3, else grey.
-    """
+    """Return bytes in two dimensions or more as images [count, height, width, 1 or 3], or None."""
     if array.dtype != np.uint8 or array.ndim < 2:
         return None
     colours = 3 if array.ndim > 2 and array.shape[-1] == 3 else 1
@@ -196,10 +190,7 @@ DECODERS: dict[str, Callable[[bytes], Any]] = {
 
 
 def decode(heard: Heard) -> Any:
-    """Decode a message of a topic of DECODERS; return a ``Rejection`` where it is not valid.
-
-    Numbers that fit their types and still have no place in a plot or on a time axis are not valid.
-    """
+    """Decode a message; ``Rejection`` also for numbers that no plot or time axis can show."""
     message = DECODERS[heard.topic](heard.payload)
     if isinstance(message, wire.Rejection):
         return message

@@ -42,7 +42,6 @@ class Outage:
     period_s: float | None = None  # From one window's begin to the next; None: there is only one
 
     def covers(self, now_s: float) -> bool:
-        """Return whether a message that leaves now is lost."""
         since_s = now_s - self.start_s
         if since_s < 0:
             return False
@@ -203,20 +202,18 @@ SHAPES: dict[str, Callable[[float], float]] = {NORMAL: lambda draw: draw, PARETO
 """How long a message is under way: shapes with mean 0 and standard deviation 1.
 
 The delay is ``delay + jitter * shape``, as with netem's distribution tables. Both shapes are
-increasing functions of one standard normal draw: the same seed delays the same messages, and only
-how far differs. A long-tailed network has a floor of ``delay - 0.58 jitter`` and rare, very late
-messages.
+increasing functions of one normal draw: the same seed delays the same messages. A long-tailed
+network has a floor of ``delay - 0.58 jitter`` and rare, very late messages.
 """
 
 
 def loss_percents(spec: DirectionSpec, rng: np.random.Generator) -> Iterator[float]:
     """Yield each message's chance to be lost, in percent.
 
-    Losses in bursts are a Markov chain with a good and a bad state, and a loss in each: the model
-    of Gilbert (1960, Capacity of a burst-noise channel) as Elliott (1963, Estimates of error rates
-    for codes on burst-noise channels) extended it. The chain begins in its stationary state and
-    steps once per message (not with time: an idle link does not recover). It goes from bad to good
-    with 1 / burst, and from good to bad so that ``loss`` stays the overall rate.
+    Bursts are a Markov chain with a good and a bad state, stepped once per message: the model of
+    Gilbert (1960, Capacity of a burst-noise channel) as Elliott (1963, Estimates of error rates for
+    codes on burst-noise channels) extended it. It goes from bad to good with 1 / burst, and from
+    good to bad so that ``loss`` stays the overall rate.
     """
     if not spec.burst_messages:
         yield from itertools.repeat(spec.loss_percent)
@@ -283,7 +280,6 @@ class Network(NamedTuple):
 
 
 def make_network(spec: LatencySpec, seed: int) -> Network:
-    """Make both directions, each with its own stream of the seed."""
     up, down = np.random.SeedSequence(seed).spawn(2)
     return Network(LatencyModel(spec.up, up), LatencyModel(spec.down, down))
 
@@ -293,8 +289,6 @@ Message = TypeVar("Message")
 
 @dataclass(frozen=True)
 class Arrival(Generic[Message]):
-    """A state that has reached the edge runtime."""
-
     step: int
     arrived_s: float
     message: Message
@@ -304,14 +298,13 @@ class Arrival(Generic[Message]):
 class VirtualLink(Generic[Message]):
     """An episode's network in virtual time, and the command that the vehicle holds.
 
-    For each tick: ``send_state``; ``next_at_edge`` and ``answer`` until None comes; ``decide``. The
-    caller gives the answers: those of a real edge runtime, or of a function. They take no virtual
-    time, so an edge runtime does not notice a gap in it: the link runs the safety machine itself,
-    from standby at each episode's start, and turns into a safe stop what that would not drive.
+    For each tick: ``send_state``; ``next_at_edge`` and ``answer`` until None comes; ``decide``.
+    Answers take no virtual time, so an edge runtime notices no gap: the link runs the safety
+    machine itself, from standby at each episode's start, and turns into a safe stop what that would
+    not drive.
 
-    ``latencies_ms`` has each newest answer's, from state sent to command received, ``stale`` counts
-    the answers that are not newer than the newest; ``period_s`` is T, ``observation_bytes`` what a
-    state carries.
+    ``latencies_ms`` has each newest answer's, from state sent to command received; ``stale`` counts
+    the answers that are not newer; ``observation_bytes`` is what a state carries.
     """
 
     def __init__(
@@ -333,7 +326,6 @@ class VirtualLink(Generic[Message]):
         self._admitted_s = 0.0
 
     def send_state(self, step: int, message: Message) -> None:
-        """Begin tick ``step``: its state leaves the vehicle."""
         tick_s = step * self._period_s
         self._step, self._window_end_s = step, tick_s + COMMAND_WINDOW * self._period_s
         for arrival_s in self._link.up.arrivals(tick_s, self._state_bytes):

@@ -18,7 +18,6 @@ UNTOLD = {UNKNOWN, TRUNCATED, STOPPED, RESTARTED, DISCARDED}
 
 
 def failed(outcome: str) -> bool:
-    """Return whether an episode is known to have missed its goal."""
     return outcome != GOAL and outcome not in UNTOLD
 
 

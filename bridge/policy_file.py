@@ -1,7 +1,6 @@
 """Write policy files; and ``python -m deploy policy``, which makes one of any ONNX model.
 
-The manifest comes from the environment: names, shapes and ranges of observations and actions, and
-the control period. The model then answers the environment for a while, in the board's own runtime.
+The manifest comes from the environment, which the model then answers for a while.
 """
 
 from __future__ import annotations
@@ -99,11 +98,7 @@ def run(arguments: argparse.Namespace, read: Callable[..., Model] = read_onnx) -
 
 
 def changed(task: Task, changes: Sequence[str]) -> Task:
-    """Return the task with changes such as ``action.0.stop=-1``; the value is JSON or plain text.
-
-    ``stop``, ``slew_per_s``, ``meaning`` and ``unit`` of an action can be changed. Raises UserError
-    for anything else.
-    """
+    """Return the task with changes such as ``action.0.stop=-1`` (JSON or text); UserError."""
     rows = msgspec.to_builtins(task.action)
     for change in changes:
         match = re.fullmatch(r"action\.(\d+)\.(stop|slew_per_s|meaning|unit)=(.*)", change)
@@ -123,10 +118,9 @@ def changed(task: Task, changes: Sequence[str]) -> Task:
 
 
 def make_policy(model: bytes, task: Task, algorithm: str, training: dict[str, Any]) -> bytes:
-    """Return a policy file's bytes: the model with its manifest in it.
+    """Return a policy file's bytes: the model with its manifest in it; UserError where none can be.
 
-    A single input and a single output may have any name and get the manifest's. Raises UserError
-    for anything but an ONNX model that the board can run.
+    A single input and a single output may have any name and get the manifest's.
     """
     edge.check_graph(model)
     graph = onnx.load_from_string(model)
@@ -146,7 +140,6 @@ def make_policy(model: bytes, task: Task, algorithm: str, training: dict[str, An
 
 
 def _rename(graph: onnx.GraphProto, old: str, new: str) -> None:
-    """Rename a value wherever it stands; another value of the new name makes room."""
     swap = {old: new, new: f"{new}_of_the_model"} if old != new else {}
     for value in (*graph.input, *graph.output, *graph.value_info, *graph.initializer):
         value.name = swap.get(value.name, value.name)
@@ -160,9 +153,8 @@ def try_policy(
 ) -> float:
     """Ask the policy in REAL_OBSERVATIONS steps; return how far it is from its own library's.
 
-    ``data`` is its file, and ``act`` its library. Raises UserError for an action that the
-    environment cannot take, or that the library does not give. Warns where answers or observations
-    are probably in other units.
+    ``data`` is its file, and ``act`` its library. Raises UserError for an action that either does
+    not give. Warns where answers or observations are probably in other units.
     """
     environment.action_space.seed(0)
     adapter, over, seen = Adapter(environment, policy.manifest), True, None
@@ -197,10 +189,7 @@ def try_policy(
 
 
 def _first_layers(data: bytes) -> Callable[[Arrays], float]:
-    """Return what tells how far an ONNX model's first layers go, before their activation.
-
-    Of all units of an observation the 99th percentile; 0 where there is no such layer.
-    """
+    """Return what tells the 99th percentile of an ONNX model's first layers, before activation."""
     model, names, deep = onnx.load_from_string(data), list[str](), set[str]()
     for node in model.graph.node:
         is_deep, is_layer = not deep.isdisjoint(node.input), node.op_type in FIRST_LAYERS

@@ -1,7 +1,6 @@
-"""Both ends of the bridge on Zenoh, options that commands share, `bridge router`, `record`, `view`.
+"""The bridge's ends on Zenoh, options that commands share, `bridge router`, `record`, `view`.
 
-Zenoh's threads only put into a listener's bounded queue, so a listener that falls behind loses
-messages and never holds up the vehicle.
+A listener that falls behind loses messages and never holds up the vehicle.
 """
 
 from __future__ import annotations
@@ -9,13 +8,13 @@ from __future__ import annotations
 import contextlib
 import math
 import queue
-import secrets
 import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -27,19 +26,17 @@ from bridge.messages import DECODERS, SHADOW, TOKEN_TOPICS, Heard, Scene, encode
 from bridge.network import SHORT_GRAMMAR, parse_spec
 from bridge.recording import Recording, RecordingWriter, choose_vehicle, heard_of, new_recording
 from bridge.rerun import FOXGLOVE_PORT, SERVE, SPAWN
-from edge_runtime import cli
+from edge_runtime import cli, transport
 from edge_runtime import tls as access
 from edge_runtime.files import check_writable
 from edge_runtime.manifest import Manifest
 from edge_runtime.sense import add_arguments as add_source
 from edge_runtime.tls import TlsFiles
-from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint, only_own, open_session, tls_for
 from edge_runtime.util import UserError, counted
 from edge_runtime.wire import DEFAULT_VEHICLE_ID, MAX_STATE_BYTES, Health, check_vehicle_id, key
 
 ANY_VEHICLE = "*"
 POLL_S = 0.1  # How soon a listener sees that the simulator has gone
-RETRY_S = 0.1
 NOT_WRITTEN = 1  # Exit status where the disk did not take the recording to its end
 LINGER_S = 2.0  # A simulator that stalls for longer than Zenoh's lease, 1 s, comes back
 TOKEN_S = 1.0  # A simulator that is there has this time to say so, however short the wait asked for
@@ -69,51 +66,22 @@ class EdgeStatus(Health, frozen=True, kw_only=True):
         return Counter(self.rejected) - Counter(before.rejected if is_same else {})
 
 
-class SimulatorPort:
-    """Publishes states and scenes, hands on commands, and sees whether an edge runtime lives."""
-
-    def __init__(
-        self, zenoh_session: zenoh.Session, vehicle_id: str, tls: TlsFiles | None = None
-    ) -> None:
-        self._zenoh, self.vehicle_id, self._tls = zenoh_session, vehicle_id, tls
-        self.session = secrets.token_hex(8)
-        # DROP: a slow listener must never hold up the simulation.
-        drop = zenoh.CongestionControl.DROP
-        self._states, self._scenes = (
-            zenoh_session.declare_publisher(f"phil/{vehicle_id}/{topic}", congestion_control=drop)
-            for topic in ("state", "scene")
-        )
-        token = zenoh_session.liveliness().declare_token(f"phil/{vehicle_id}/simulator")
-        self._declared: list[Any] = [self._states, self._scenes, token]
-
-    def hear(self, topic: str, handler: Callable[[bytes], None]) -> None:
-        """Call ``handler(payload)``, which must be quick, for every message of the topic."""
-        own = key(self.vehicle_id, topic)
-        hear = only_own(own, lambda sample: handler(sample.payload.to_bytes()))
-        self._declared.append(self._zenoh.declare_subscriber(own, hear))
-
-    def publish_state(self, payload: bytes) -> None:
-        """Send an encoded state to the edge runtime (and to viewers); UserError once expired."""
-        if self._tls is not None:
-            self._tls.require_valid(time.time())
-        self._states.put(payload)
+class SimulatorPort(transport.SimulatorEnd):
+    """The end that also shows scenes, and sees whether an edge runtime lives."""
 
     def publish_scene(self, environment: Any, stamps: Scene) -> None:
         """Send the scene, or else the environment's picture, if anybody is listening."""
-        somebody: Any = self._scenes.matching_status
+        somebody: Any = self.scenes.matching_status
         if somebody.matching:
-            self._scenes.put(scene_payload(environment, stamps))
+            self.scenes.put(scene_payload(environment, stamps))
 
     def wait_for_edge(self, limit_s: float, start: str) -> EdgeStatus:
-        """Wait until an edge runtime for this vehicle is there; UserError after ``limit_s``.
-
-        ``start`` is the command that starts one.
-        """
+        """Wait for an edge runtime; UserError that names what to ``start``, after ``limit_s``."""
         give_up_s = time.monotonic() + limit_s
         while (status := self.edge_status()) is None:
             if time.monotonic() >= give_up_s:
                 raise UserError(f"no edge runtime after {limit_s:g} s; start one: {start}")
-            time.sleep(RETRY_S)
+            time.sleep(transport.RETRY_S)
         return status
 
     def edge_status(self) -> EdgeStatus | None:
@@ -124,35 +92,8 @@ class SimulatorPort:
                     return msgspec.json.decode(reply.ok.payload.to_bytes(), type=EdgeStatus)
         return None
 
-    def close(self) -> None:
-        """Undeclare everything: a callback left open hangs the process at its end."""
-        for declared in reversed(self._declared):
-            declared.undeclare()
 
-
-@contextlib.contextmanager
-def open_port(
-    listen: str | None,
-    vehicle_id: str,
-    tls: TlsFiles | None = None,
-    connect: str | None = None,
-    wait_s: float = 0.0,
-) -> Iterator[SimulatorPort]:
-    """Listen at ``listen`` for the edge runtime, or share the router at ``connect`` with others.
-
-    With ``tls``, every other party has the rights of its certificate's name and no more; behind a
-    router it is the router that sees to that.
-    UserError if the port is busy, or if no router answers within ``wait_s``.
-    """
-    listens = connect is None
-    rules = None if tls is None else access.rules_for_simulator(tls, vehicle_id, listens)
-    # Behind a router a client: two peers there would not hear one another.
-    if connect is not None:
-        session = connect_client(connect, wait_s, tls)
-    else:
-        session = open_session(listen=listen, mode="router", tls=tls, access=rules)
-    with closing(session), closing(SimulatorPort(session, vehicle_id, tls)) as port:
-        yield port
+open_port = partial(transport.open_simulator, SimulatorPort)
 
 
 class WireListener:
@@ -177,8 +118,7 @@ class WireListener:
         return None
 
     def until_gone(self, linger_s: float = LINGER_S) -> Iterator[Heard | None]:
-        """Yield messages, and None where none comes, until the queue is empty and no simulator has
-        been there for ``linger_s``.
+        """Yield messages, and None where none comes, until no simulator was there for ``linger_s``.
 
         An edge runtime behind a router goes on sending without a simulator.
         """
@@ -197,7 +137,6 @@ class WireListener:
         self._put(sample, sample.payload.to_bytes() if size <= MAX_STATE_BYTES else b"", size)
 
     def watch(self, sample: zenoh.Sample) -> None:
-        """Queue the change of a token."""
         key, here = str(sample.key_expr), sample.kind != zenoh.SampleKind.DELETE
         if key.endswith("/simulator") and "*" not in key:
             (self._simulators.add if here else self._simulators.discard)(key)
@@ -222,15 +161,14 @@ def open_listener(
 ) -> Iterator[WireListener]:
     """Listen to one vehicle, or to ANY_VEHICLE.
 
-    UserError if no simulator for it is at ``connect`` within ``wait_s``, and for a certificate that
-    may not listen: from here that would look the same.
+    UserError if no simulator for it is at ``connect`` within ``wait_s``, or a certificate may not.
     """
     if tls is not None:
         own = [access.common_name(access.SHADOW, vehicle_id)] if vehicle_id != ANY_VEHICLE else []
         access.check_name(tls.name, access.VIEWER, *own)
     give_up_s = time.monotonic() + wait_s
     with contextlib.ExitStack() as stack:
-        session = stack.enter_context(closing(connect_client(connect, wait_s, tls)))
+        session = stack.enter_context(closing(transport.connect_client(connect, wait_s, tls)))
         listener, keys = WireListener(), f"phil/{vehicle_id}"
         if tls is not None:
             listener.end_s = tls.expires.timestamp()
@@ -261,7 +199,7 @@ def open_source(arguments: Any) -> Iterator[Iterator[Heard | None]]:
         recording.say_trouble()
         return
     where, vehicle_id = arguments.connect, arguments.vehicle_id or DEFAULT_VEHICLE_ID
-    tls = tls_for(arguments.tls, where)
+    tls = transport.tls_for(arguments.tls, where)
     with open_listener(where, vehicle_id, arguments.wait_s, tls) as listener:
         yield listener.until_gone()
         _say_dropped(listener)
@@ -273,19 +211,7 @@ def _say_dropped(listener: WireListener) -> None:
         print(f"{dropped} came faster than they could be taken", file=sys.stderr)
 
 
-def connect_client(endpoint: str, wait_s: float, tls: TlsFiles | None = None) -> zenoh.Session:
-    """Open a client, trying again for ``wait_s``: both ends are often started together."""
-    give_up_s = time.monotonic() + wait_s
-    while True:
-        try:
-            return open_session(connect=endpoint, mode="client", tls=tls)
-        except UserError:
-            if time.monotonic() >= give_up_s:
-                raise
-            time.sleep(RETRY_S)
-
-
-ENDPOINT = {"metavar": "PROTOCOL/HOST:PORT", "type": check_endpoint}
+ENDPOINT = {"metavar": "PROTOCOL/HOST:PORT", "type": transport.check_endpoint}
 _SECONDS = {"metavar": "SECONDS", "type": cli.seconds}
 _ID = {"metavar": "ID", "type": check_vehicle_id, "default": DEFAULT_VEHICLE_ID}
 _TLS = "folder of this party's certificate, from `deploy certs`; turns TLS on (tls/HOST:PORT)"
@@ -294,7 +220,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--listen": {**ENDPOINT, "help": "endpoint on which edge runtimes and viewers connect"},
     "--connect": {
         **ENDPOINT,
-        "default": DEFAULT_ENDPOINT,
+        "default": transport.DEFAULT_ENDPOINT,
         "help": "endpoint of the simulator or router",
     },
     "--tls": {"metavar": "DIR", "type": "path", "help": _TLS},
@@ -320,7 +246,7 @@ def wait_to_be_told(tls: TlsFiles | None = None) -> NoReturn:
     A signal that the kernel hands to a thread of Zenoh's wakes nobody from a lock: so it polls.
     """
     while True:
-        time.sleep(RETRY_S)
+        time.sleep(transport.RETRY_S)
         if tls is not None:
             tls.require_valid(time.time())
 
@@ -330,7 +256,7 @@ def wait_to_be_told(tls: TlsFiles | None = None) -> NoReturn:
     "python -m bridge router --listen tls/0.0.0.0:7447 --tls certs/router",
 )
 def router(parser: Any) -> None:
-    listen = f"endpoint for all others; may be repeated (default: {DEFAULT_ENDPOINT})"
+    listen = f"endpoint for all others; may be repeated (default: {transport.DEFAULT_ENDPOINT})"
     vehicle = "with --tls: a vehicle whose parties have rights here; may be repeated"
     vehicle += f" (default: {DEFAULT_VEHICLE_ID})"
     add_options(parser, "--tls")
@@ -341,15 +267,15 @@ def router(parser: Any) -> None:
 
 def run_router(arguments: Any) -> int:
     """Route until SIGTERM or ^C; without ``--tls``, everything that anybody sends."""
-    listens, connect = arguments.listen or [DEFAULT_ENDPOINT], arguments.connect
-    tls, rules = tls_for(arguments.tls, *listens, *[connect] * bool(connect)), None
+    listens, connect = arguments.listen or [transport.DEFAULT_ENDPOINT], arguments.connect
+    tls, rules = transport.tls_for(arguments.tls, *listens, *[connect] * bool(connect)), None
     if tls is not None:
         access.check_name(tls.name, access.ROUTER)
         rules = access.rules_for_listener(arguments.vehicle_id or [DEFAULT_VEHICLE_ID])
     with (
         contextlib.suppress(KeyboardInterrupt),
         cli.sigterm_as_interrupt(),
-        closing(open_session(listens, connect, "router", tls, rules)),
+        closing(transport.open_session(listens, connect, "router", tls, rules)),
     ):
         print(f"ready {','.join(listens)}", flush=True)
         wait_to_be_told(tls)
@@ -371,7 +297,7 @@ def record(parser: Any) -> None:
 
 
 def run_record(arguments: Any) -> int:
-    tls = tls_for(arguments.tls, arguments.connect)
+    tls = transport.tls_for(arguments.tls, arguments.connect)
     path, vehicle_id = Path(arguments.out), arguments.vehicle_id or ANY_VEHICLE
     with (
         cli.sigterm_as_interrupt(),

@@ -1,9 +1,8 @@
 """Recordings of the wire as MCAP files, read and written.
 
-The topics ``phil/<id>/...`` hold the exact payloads; ``view/<id>/...`` hold copies for Foxglove, in
-JSON with a JSON Schema: of each message, of its pictures (``foxglove.RawImage``, frame t-1 above
-frame t), of the road from above (``foxglove.SceneUpdate``), and ``events`` (``foxglove.Log``:
-tokens, unreadable and oversized messages).
+The topics ``phil/<id>/...`` hold the exact payloads, ``view/<id>/...`` copies for Foxglove in JSON:
+messages, pictures (frame t-1 above frame t), the road from above, and ``events`` (tokens,
+unreadable and oversized messages).
 """
 
 from __future__ import annotations
@@ -64,10 +63,10 @@ class Recording:
             print(line, file=sys.stderr, flush=True)
 
     def messages(self) -> Iterator[tuple[Channel, Message]]:
-        """Yield the messages, with their channels, in the order of the file, that of arrival.
+        """Yield the messages, with their channels, in the order of their arrival.
 
-        A damaged chunk is left out and counted; a torn file is read up to the tear.
-        UserError for a file that is not there, cannot be read, or is no MCAP at all.
+        A damaged chunk is left out and counted; a torn file is read up to the tear. UserError for
+        no MCAP.
         """
         self.cut_off, self.damaged_places, self._whole_chunks = True, 0, 0
         try:
@@ -128,7 +127,6 @@ def choose_vehicle(recording: Recording, vehicle_id: str | None) -> str:
 
 
 def heard_of(recording: Recording, vehicle_id: str) -> Iterator[Heard]:
-    """Yield the wire's messages of one vehicle as a listener would have heard them."""
     for channel, message in recording.messages():
         vehicle, topic = _wire_topic(channel)
         if vehicle == vehicle_id:
@@ -184,7 +182,6 @@ class RecordingWriter:
         self._flush_s = time.monotonic() + FLUSH_S
 
     def finish(self) -> None:
-        """Write the index: the recording is whole."""
         self._mcap.finish()
         self._file.close()
 
@@ -362,7 +359,6 @@ class ViewerCopies:
         self._copy(heard, "events", Log(_stamp(heard), level, text, heard.vehicle_id))
 
     def _copy(self, heard: Heard, name: str, values: msgspec.Struct) -> None:
-        """Add what viewers can draw, to the vehicle's topic of that name."""
         fields = msgspec.structs.asdict(values).items()
         unknown = (None, msgspec.UNSET)
         drawn = {n: v for n, v in fields if n not in NOT_COPIED and v not in unknown}

@@ -1,23 +1,19 @@
 """``python -m bridge replay``: run recorded states through a policy and compare its commands.
 
 The policy runs inside the edge runtime's own decision logic, at the times that the recorded
-runtime stamped: two replays of one file are the same. The stamps are carried over to the recorder's
-clock, since a board's clock may be set during a drive.
+runtime stamped, by the recorder's clock: two replays of one file are the same.
 """
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from bridge.ports import add_options
 from bridge.recording import Recording, choose_vehicle, valid_messages
-from bridge.report import write_figure
 from edge_runtime.cli import ArgumentParser, examples, not_negative_number
 from edge_runtime.config import BUILT_IN, NONE, Config, add_trust, load_config
 from edge_runtime.controller import (
@@ -33,7 +29,7 @@ from edge_runtime.manifest import Task
 from edge_runtime.policy import Policy, infer, load_policy
 from edge_runtime.safety import Event, Mode
 from edge_runtime.util import UserError, name_in_file, printable
-from edge_runtime.vehicles import find_vehicle, installed_as, vehicle_limits
+from edge_runtime.vehicles import find_vehicle, vehicle_limits
 from edge_runtime.wire import DRIVE, Command, Health, State, is_foreign
 
 RUNTIME_ENDED = "runtime_ended"  # Reason of a runtime's farewell, which answers no state
@@ -43,7 +39,6 @@ CLOCK_STEP_S = 1.0  # Stamps that leap by more against the recorder's: a clock w
 DEFAULT_TOLERANCE = 1e-5  # Two processors round differently, by far less than this
 DIFFERENT = 1  # Exit status where at least one command differs
 SHOWN_DIFFERENCES = 10
-MOST_PANELS, LEAST_DRAWN = 8, 1e-9  # Of a picture: actions, and difference
 
 Key = tuple[str, int, int]  # Session, episode, step
 
@@ -58,8 +53,6 @@ class Exchange(NamedTuple):
 
 Row = tuple[State, Command | None, Order | None]
 """A state with its recorded answer and the replayed one; no recorded answer of the policy: None."""
-Drawn = tuple[Sequence[float], Sequence[float], float]
-"""The recorded action, the replayed one, and how far they are apart."""
 EXAMPLE = examples("python -m bridge replay drive.mcap --policy my.onnx --public-key policy.pub")
 
 
@@ -75,8 +68,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     apart = "largest difference of two equal actions, in the unit of the action"
     kind = not_negative_number
     add("--tolerance", metavar="X", type=kind, default=DEFAULT_TOLERANCE, help=apart)
-    out = "report to write, as JSON, and beside it a picture R.png of recorded and replayed actions"
-    add_options(parser, "--out", help=out)
+    add_options(parser, "--out")
 
 
 def run(arguments: Any) -> int:
@@ -84,13 +76,8 @@ def run(arguments: Any) -> int:
     drive = RecordedDrive(Path(arguments.recording), arguments.vehicle_id)
     policy = load_policy(arguments.policy, arguments.public_key, arguments.allow_unsigned)
     config = load_config(arguments.config, {"policy": arguments.policy}, opens_link=False)
-    report, drawn = report_replay(drive, policy, config, arguments.tolerance)
+    report = report_replay(drive, policy, config, arguments.tolerance)
     write_json_out(arguments.out, report)
-    if arguments.out:
-        names = [row.name for row in policy.manifest.action]
-        write_figure(
-            draw(drawn, names, arguments.tolerance), Path(arguments.out).with_suffix(".png")
-        )
     print(
         f"{report['compared']} commands compared, {report['different']} differ; largest difference"
         f" {report['largest_difference']:.3g}, tolerance {report['tolerance']:g};"
@@ -104,21 +91,17 @@ def run(arguments: Any) -> int:
 
 def report_replay(
     drive: RecordedDrive, policy: Policy, config: Config, tolerance: float = DEFAULT_TOLERANCE
-) -> tuple[dict[str, Any], list[Drawn]]:
-    """Replay a drive; return the command's report, and what a picture shows.
-
-    Raises UserError where nothing can be compared.
-    """
-    compared, drawn = compare(replay(drive, policy, config), tolerance)
+) -> dict[str, Any]:
+    """Replay a drive; return the command's report. UserError where nothing can be compared."""
     report = {
         "recording": str(drive.recording.path),
         "policy_id": policy.policy_id,
         "recorded_policy_ids": sorted({each.command.policy_id for each in drive.answers.values()}),
-        **compared,
+        **compare(replay(drive, policy, config), tolerance),
     }
     if report["compared"] == 0:
         raise UserError(f"{drive.recording.path} holds no state with an answer of its policy")
-    return report, drawn
+    return report
 
 
 class RecordedDrive:
@@ -187,10 +170,9 @@ def key_of(message: State | Command) -> Key:
 def replay(drive: RecordedDrive, policy: Policy, config: Config) -> Iterator[Row]:
     """Yield every state with its recorded and its replayed answer.
 
-    Which vehicle was attached is the recording's, and so is what befell it: when it failed, when
-    an operator re-armed (before a state that was answered with ``drive``), and when the runtime was
-    started anew, armed or not. Its limits follow from ``config``. UserError where it lacks an
-    action of the policy or cannot follow its scenario.
+    The recording says which vehicle was attached, when it failed, when an operator re-armed (before
+    a state that was answered with ``drive``), and when the runtime was started anew. Its limits
+    follow from ``config``. UserError where it lacks an action of the policy.
     """
     limits = shared_limits(policy.manifest.action, _vehicle_limits(drive, policy, config))
     commands = [each.command for each in drive.answers.values()]
@@ -217,7 +199,7 @@ def _vehicle_limits(drive: RecordedDrive, policy: Policy, config: Config) -> Lim
         name = config.vehicle  # A module:Class; the recording has the class's name
     elif name not in (NONE, *BUILT_IN):
         option = "--config FILE.toml whose table [vehicle] has as its driver"
-        name = name_in_file(installed_as(name), f"{drive.recording.path} is of", option)
+        name = name_in_file(name, f"{drive.recording.path} is of", option)
     return vehicle_limits(name, config.vehicle_settings, policy.manifest, config.bounds)
 
 
@@ -273,13 +255,13 @@ def _watchdog(controller: Controller, until_s: float) -> None:
         controller.tick(due_s + JUST_AFTER_S)
 
 
-def compare(rows: Iterable[Row], tolerance: float) -> tuple[dict[str, Any], list[Drawn]]:
-    """Return the part of the report that says what differs, and each pair of answers.
+def compare(rows: Iterable[Row], tolerance: float) -> dict[str, Any]:
+    """Return the part of the report that says what differs.
 
-    States without a recorded answer are counted, not compared. Two answers are equal where mode
-    and reason are, and no action, planned ones included, is further apart than ``tolerance``.
+    Two answers are equal where mode and reason are, and no action, planned ones included, is
+    further apart than ``tolerance``. States without a recorded answer are counted only.
     """
-    kinds, unanswered, drawn = Counter[str](), 0, list[Drawn]()
+    kinds, unanswered, largest = Counter[str](), 0, 0.0
     differences: list[dict[str, Any]] = []
     for state, recorded, order in rows:
         if recorded is None:
@@ -287,48 +269,20 @@ def compare(rows: Iterable[Row], tolerance: float) -> tuple[dict[str, Any], list
             continue
         kinds[f"{recorded.mode}: {recorded.reason}".removesuffix(": ")] += 1
         distance = _distance(recorded, order)
-        drawn.append((recorded.action, order.action if order else (), distance))
+        largest = max(largest, distance if distance < math.inf else 0.0)
         if distance > tolerance:
             place = dict(zip(("session", "episode", "step"), key_of(state), strict=True))
             replayed = None if order is None else _told(order)
             differences.append({**place, "recorded": _told(recorded), "replayed": replayed})
-    report = {
+    return {
         "compared": kinds.total(),
         "unanswered": unanswered,
         "different": len(differences),
-        "largest_difference": max([0.0, *(d for *_, d in drawn if math.isfinite(d))]),
+        "largest_difference": largest,
         "tolerance": tolerance,
         "by_recorded": dict(kinds),
         "first_differences": differences[:SHOWN_DIFFERENCES],
     }
-    return report, drawn
-
-
-def draw(drawn: Sequence[Drawn], names: Sequence[str], tolerance: float) -> Any:
-    """Draw both answers of each state, a panel an action, and how far they are apart."""
-    from matplotlib.figure import Figure
-
-    names = names[:MOST_PANELS]
-    figure = Figure(figsize=(10, 1.8 * len(names) + 1.8), layout="constrained")
-    *panels, below = figure.subplots(len(names) + 1, sharex=True)
-    *answers, apart = zip(*drawn, strict=True)
-    (differ,) = np.nonzero(np.array(apart) > tolerance)
-    unknown = [math.nan] * len(names)
-    recorded, replayed = (
-        np.array([[*a, *unknown][: len(names)] for a in each]) for each in answers
-    )
-    for place, (name, panel) in enumerate(zip(names, panels, strict=True)):
-        panel.plot(recorded[:, place], label="recorded")
-        panel.plot(replayed[:, place], "--", label="replayed")
-        panel.plot(differ, recorded[differ, place], ".", color="C3", label=f"{len(differ)} differ")
-        panel.set_ylabel(name)
-    panels[0].legend(fontsize=8)
-    # A stop where the other drives is no distance: it stands at the top.
-    below.semilogy(np.clip(apart, LEAST_DRAWN, max([1.0, *filter(math.isfinite, apart)])), ".")
-    below.axhline(tolerance, color="0.4", lw=0.8, linestyle="--")
-    below.set_ylabel("difference")
-    below.set_xlabel("answered states, in their order")
-    return figure
 
 
 def _told(answer: Command | Order) -> dict[str, Any]:

@@ -1,8 +1,4 @@
-"""Results of episodes, safe stops, and the report with the contract's keys (section 2).
-
-`EpisodeResult` and `summarise` serve driving in process (trainer) and over the wire (bridge); the
-rest is for ``bridge simulate``. `ProgressBar` shows how far any command is.
-"""
+"""Results of episodes, safe stops, and the report with the contract's keys (section 2)."""
 
 from __future__ import annotations
 
@@ -40,12 +36,10 @@ DOTS_PER_INCH, KEPT_COLOURS = 110, 64  # Of a figure
 
 @dataclass
 class EpisodeResult:
-    """One driven episode.
+    """One driven episode; `actions` holds what the environment was given in each step.
 
-    `outcome` is as in the contract for this repository's environments; another environment may
-    report its own word, FAILED, TRUNCATED or UNKNOWN. Accelerations are the mean of |a| over the
-    episode's steps, None where they are unknown. `actions` holds for each step the action that the
-    environment was given, as floats.
+    `outcome` is the contract's word, the environment's own, FAILED, TRUNCATED or UNKNOWN.
+    Accelerations are the mean of |a| over the steps, None where they are unknown.
     """
 
     seed: int
@@ -64,8 +58,7 @@ def summarise(
 ) -> dict[str, Any]:
     """Settle the outcomes of `results` and return the contract's summary.
 
-    `std` is over the episodes (population, ddof 0). Mean and deviation are None for a quantity that
-    no episode reports.
+    `std` is over the episodes (ddof 0). Mean and deviation of what no episode reports are None.
     """
     for result, outcome in zip(results, settled(r.outcome for r in results), strict=True):
         result.outcome = outcome
@@ -101,7 +94,6 @@ def number_of(info: Mapping[str, Any], name: str) -> float | None:
 
 
 def of_known(values: Iterable[float | None], figure: Any = np.mean) -> float | None:
-    """Return the figure of the values that are not None; None if all are."""
     known = [value for value in values if value is not None]
     return float(figure(known)) if known else None
 
@@ -158,11 +150,7 @@ def make_report(
     latencies_ms: Sequence[float],
     facts: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Join the summary of the episodes with what happened on the wire.
-
-    ``facts`` are further rows of the report: what was asked for, counts, and ``policy_ids``. The
-    report's policy_id is that of the policy that appeared last.
-    """
+    """Join the summary with what happened on the wire, and further rows, ``facts``."""
     policy_id = next(reversed(facts["policy_ids"]), "")
     summary = summarise(results, facts["scenario"], facts["condition"], policy_id, facts["seed"])
     return {
@@ -198,7 +186,6 @@ def summary_line(report: Mapping[str, Any]) -> str:
 
 
 def _reasons(noun: str, counts: Mapping[str, int]) -> str:
-    """Return text like "3 safe stops (2 no_command, 1 vehicle_fault)"."""
     each = ", ".join(f"{count} {reason}" for reason, count in counts.items() if count)
     return counted(sum(counts.values()), noun) + (f" ({each})" if each else "")
 
@@ -216,10 +203,7 @@ LINE_INTERVAL_S = 15.0  # Between two lines of progress where stderr is no termi
 
 
 class ProgressBar:
-    """Counts to ``total`` and shows figures, e.g. ``{"success": "0.85"}``: a bar on stderr.
-
-    Where stderr is no terminal, it prints a line now and then.
-    """
+    """Counts to ``total``, with figures such as ``{"success": "0.85"}``; lines if no terminal."""
 
     def __init__(self, what: str, total: int, done: int = 0) -> None:
         self.what, self.total, self.done = what, total, done

@@ -1,8 +1,7 @@
 """``python -m bridge shadow``: a policy beside the one that drives; it answers and moves nothing.
 
-It hears the states that the driving runtime gets, on the wire or from a recording, and decides as
-the edge runtime would. Its answers go into view, recording and report only: it opens a listener,
-which has no way to publish.
+It decides as the edge runtime would, on the wire's states or a recording's. Its answers go into
+view, recording and report only: a listener has no way to publish.
 """
 
 from __future__ import annotations
@@ -110,8 +109,7 @@ class Shadow:
         self._answered, self._would_stop = 0, Counter[str]()
         self._orders: dict[Key, Order] = {}  # Those that no command was compared with yet
         self._driving_policy_id: str | None = None
-        self._compared: list[list[float]] = []
-        """Of each state: episode, step, simulated time, and the difference of each action."""
+        self._compared: list[list[float]] = []  # Of each state, the difference of each action
 
     def stream(self, all_heard: Iterable[Heard | None]) -> Iterator[Heard]:
         """Yield all messages and, behind each state, this policy's answer as a message of its own.
@@ -166,10 +164,7 @@ class Shadow:
         yield Heard(key, SHADOW, payload, heard.arrived_ns, len(payload))
 
     def _infer(self, state: State) -> tuple[np.ndarray | None, int]:
-        """Return the network's action, or None, and how long it took, ns.
-
-        More than T stands for longer. A network that hangs is asked again when it has ended.
-        """
+        """Return the network's action, or None, and how long it took, ns; more than T: longer."""
         seen, found = self._policy.layout.arrays(state.observation), []
 
         def infer() -> None:
@@ -195,22 +190,16 @@ class Shadow:
         order = self._orders.pop(key_of(command), None) if command.mode == DRIVE else None
         if order and order.mode == DRIVE and len(order.action) == len(command.action):
             pairs = zip(order.action, command.action, strict=True)
-            apart = [abs(ours - theirs) for ours, theirs in pairs]
-            sim_time_s = order.answers.state.sim_time_s
-            self._compared.append([command.episode, command.step, sim_time_s, *apart])
+            self._compared.append([abs(ours - theirs) for ours, theirs in pairs])
 
     def report(self) -> dict[str, Any]:
         """Return the report; None stands where there is nothing to tell a number of."""
         names = [row.name for row in self._policy.manifest.action]
-        rows = np.array(self._compared).reshape(-1, 3 + len(names))
-        disagreement, largest_at = {}, {}
-        for name, values in zip(names, rows.T[3:], strict=True):
+        rows: Any = np.array(self._compared).reshape(-1, len(names))
+        disagreement = {}
+        for name, values in zip(names, rows.T, strict=True):
             mean = float(values.mean()) if len(rows) else None
             disagreement[name] = {"mean": mean, **percentiles(values, p95=95, max=100)}
-            if len(rows):
-                episode, step, time_s = rows[values.argmax(), :3].tolist()
-                at = {"episode": int(episode), "step": int(step), "time_s": time_s}
-                largest_at[name] = at
         return {
             "policy_id": self._policy.policy_id,
             "driving_policy_id": self._driving_policy_id,
@@ -218,7 +207,6 @@ class Shadow:
             "answered": self._answered,
             "compared": len(rows),
             "disagreement": disagreement,
-            "largest_at": largest_at,
             "would_stop": dict(self._would_stop),
             "inference_ms": percentiles(self._inferences_ms, p50=50, p99=99),
         }

@@ -1,7 +1,4 @@
-"""``python -m bridge simulate``: serve an environment to an edge runtime, and write a report.
-
-`EpisodeRunner` drives one episode of an environment over the wire, by any clock.
-"""
+"""``python -m bridge simulate``: serve an environment to an edge runtime, and write a report."""
 
 from __future__ import annotations
 
@@ -167,9 +164,8 @@ def policy_action(adapter: Adapter, decision: Decision) -> np.ndarray:
 def vehicle_action(adapter: Adapter, decision: Decision) -> np.ndarray:
     """Return what the vehicle's actuators have reached; the safe stop without feedback.
 
-    Where the vehicle reports the speed of the scenario's car and the environment knows which pedal
-    leads to it (``pedal_for_speed``), that pedal takes the place of the reported one: it makes up
-    for what the last step missed, while errors of pedals would add up.
+    Where the environment knows which pedal leads to the speed that the vehicle reports
+    (``pedal_for_speed``), that one is taken: errors of pedals would add up.
     """
     adapter.press_brake(bool(decision.brake_reason))
     if decision.feedback is None:
@@ -202,7 +198,7 @@ class EpisodeRunner:
         self.deadline_misses = 0
 
     def show_task(self, seed: int) -> None:
-        """Send one state, which is final, so that the edge runtime compares the task as well.
+        """Send one final state, so that the edge runtime compares the task as well.
 
         It holds no observation: another policy's may be of another size.
         """
@@ -212,8 +208,8 @@ class EpisodeRunner:
     def run(self, episode: int, seed: int) -> EpisodeResult:
         """Drive one episode to its end; the seed decides the environment and the link.
 
-        Where it is cut short (^C, a fault of the environment) a final state goes out as well, so
-        that the edge runtime stands by instead of stopping for a link that seems to be lost.
+        Where it is cut short (^C, a fault of the environment) a final state goes out as well: the
+        edge runtime stands by, and does not stop for a lost link.
         """
         self._under_way: State | None = None
         try:

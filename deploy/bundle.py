@@ -1,7 +1,7 @@
 """``python -m deploy bundle`` and ``push``: what a board needs to drive one policy, in one archive.
 
 The same inputs give the same bytes: the archive holds no time, place or user name. A lock names
-every wheel by version and hash; a folder keeps the wheels, so only the first one needs a network.
+every wheel by version and hash; only the first bundle needs a network.
 """
 
 from __future__ import annotations

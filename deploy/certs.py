@@ -1,9 +1,7 @@
 """``python -m deploy keys`` and ``certs``: who may sign, and who may talk to whom.
 
-An Ed25519 pair signs policies and bundles. The owner's authority makes a TLS certificate for each
-party. Its common name says which party it is; `edge_runtime.tls` holds what each party may send
-and hear. Only parties that listen get a server's certificate, so no viewer or operator can pose as
-a simulator.
+A certificate's common name says which party it is; `edge_runtime.tls` holds what that may send and
+hear. Only parties that listen get a server's certificate: no viewer can pose as a simulator.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """The command line: `python -m edge_runtime`, or `phil-edge` where the wheel is installed.
 
-Here are the commands that do not drive: `check` of a policy, and an operator's `status` and
-`rearm`. `run`, `sense` and `jog` are in files of these names.
+`run`, `sense` and `jog` are in files of these names, the other commands here.
 """
 
 from __future__ import annotations
@@ -99,9 +98,10 @@ def _status(arguments: argparse.Namespace) -> int:
 )
 def status(parser: argparse.ArgumentParser) -> None:
     _add_operator(parser)
-    parser.add_argument("--out", metavar="FILE.json", help="write the whole status to this file")
+    add = parser.add_mutually_exclusive_group().add_argument
+    add("--out", metavar="FILE.json", help="write the whole status to this file")
     text = "show once a second, until ^C, what matters beside the vehicle"
-    parser.add_argument("--watch", action="store_true", help=text)
+    add("--watch", action="store_true", help=text)
 
 
 def _rearm(arguments: argparse.Namespace) -> int:

@@ -65,11 +65,9 @@ class Leash:
 
     @property
     def left_m(self) -> float:
-        """How far it may still go; inf without a leash."""
         return max(self._length_m - self._gone_m, 0.0)
 
     def begin(self) -> None:
-        """Start anew: a person has re-armed the vehicle."""
         self._gone_m = 0.0
 
     def note(self, speed_mps: float, now_s: float) -> None:

@@ -109,8 +109,8 @@ def program(
 ) -> Callable[[list[str]], int]:
     """Make the `main(argv)` that runs one of many commands. `shown` are examples for its help.
 
-    `commands` has for each name a `Subcommand` and one line on what it does; or a place that is
-    loaded only when it is asked for: `module:name` of a Subcommand, or a module that is like one.
+    `commands` has for each name one line on what it does, and a `Subcommand`, or the place that is
+    loaded when it is asked for: `module:name` of one, or a module that is like one.
     """
 
     def main(argv: list[str]) -> int:

@@ -39,8 +39,8 @@ class RideThrough(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """All settings of `run`. Relative paths start at the working directory.
 
-    `vehicle_settings` are the tables [vehicle.NAME], by name; each driver checks its own. The four
-    before it are of [vehicle]: bounds (None: none), and which episodes need a re-arm.
+    The last five are [vehicle]'s: bounds (None: none), which episodes need a re-arm, and the tables
+    [vehicle.NAME], by name, which each driver checks.
     """
 
     policy: Optional[str] = None
@@ -97,7 +97,6 @@ def add_flags(parser: Any, *names: str) -> None:
 
 
 def add_trust(parser: Any) -> None:
-    """Add the flags that say which policy may drive to a parser or group."""
     add_public_key(parser, "; with --allow-unsigned, policy.pub in the policy's folder comes first")
     text = "drive a policy without a signature or a known key; a wrong signature is still refused"
     parser.add_argument("--allow-unsigned", action="store_true", default=None, help=text)
@@ -116,17 +115,17 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def load_config(path: Optional[PathLike], flags: Dict[str, Any], opens_link: bool = True) -> Config:
-    """Load the file's settings; flags that are not None take their place.
+    """Load the file's settings; flags that are not None take their place. UserError for bad ones.
 
     `opens_link` False: TLS settings are not held against the address, for nothing is connected.
-    Raises UserError for a file that is no TOML, an unknown key, and a value out of range.
     """
     given = {name: value for name, value in flags.items() if value is not None}
     bus = given.pop("bus", None)
     settings: Dict[str, Any] = {}
     if path is not None:
+        tables = read_toml(path, "config file")
         try:
-            settings = _split_vehicle(read_toml(path, "config file"))
+            settings = _split_vehicle(tables)
             _check(convert(settings, Config))
         except UserError as error:
             raise UserError(f"config file {path}: {error}") from None
@@ -149,6 +148,9 @@ def _split_vehicle(tables: Dict[str, Any]) -> Dict[str, Any]:
     settings = dict(tables["vehicle"])
     driver = settings.pop("driver", NONE)
     rules = {name: settings.pop(name) for name in _RULES if name in settings}
+    for name in (name for name, value in settings.items() if not isinstance(value, dict)):
+        known = f"driver, {', '.join(_RULES)} and a table for each driver"
+        raise UserError(f"vehicle.{name} is no setting; [vehicle] has {known}")
     return {**tables, **rules, "vehicle": driver, "vehicle_settings": settings}
 
 
@@ -172,6 +174,5 @@ def _check(config: Config) -> Config:
 
 
 def check_choice(key: str, value: str, known: Sequence[str]) -> None:
-    """Raise UserError for a value that is not known."""
     if value not in known:
         raise UserError(f"{key} {value!r} is not known; choose from {', '.join(known)}")

@@ -81,9 +81,8 @@ def stop_action(last: Sequence[float], limits: Limits) -> List[float]:
 class Ride:
     """Makes the plan of each drive command. Where it `plays`, it keeps the newest one.
 
-    A plan asks once more for what the policy wanted, in each further period: fading to neutral, a
-    learnt plan and predicted pictures served no better (docs/ride_through.md).
-    `max_s` becomes whole periods. Raises UserError where no plan can be as long.
+    A plan asks once more for what the policy wanted, in each further period: nothing else served
+    better (docs/ride_through.md). UserError where no plan can be as long as `max_s`.
     """
 
     def __init__(self, max_s: float, period_s: float, limits: Limits, plays: bool) -> None:
@@ -177,7 +176,7 @@ class ControllerConfig(NamedTuple):
 
     `needs_rearm`: a vehicle is attached, and only an operator lets it drive after a stop; with
     `each_episode`, in each new episode too, where the start counts for the first one. `task` is the
-    policy's; a state that names another one is a fault. `ride_s` is [ride_through] max_s.
+    policy's, `ride_s` [ride_through] max_s.
     """
 
     limits: Limits
@@ -192,8 +191,7 @@ class ControllerConfig(NamedTuple):
 class Controller:
     """One state at a time: `begin` when the policy starts on it, `finish` with its answer.
 
-    `tick` is called at `next_deadline_s` and gives the orders that time alone causes. UserError
-    where no plan can be as long as `ride_s`.
+    `tick` is called at `next_deadline_s` and gives the orders that time alone causes.
     """
 
     def __init__(self, config: ControllerConfig) -> None:
@@ -232,7 +230,6 @@ class Controller:
         return self.vehicle_fault or self._latched_fault
 
     def begin(self, received: Received, now_s: float) -> None:
-        """Note that the policy starts on the newest state."""
         session, arrived_s = received.state.session, received.arrived_s
         # The gap counts even where the watchdog did not get to run within it.
         event = rules.classify_arrival(self.safety, session, arrived_s, self._needs_rearm)

@@ -19,8 +19,8 @@ from edge_runtime.util import PathLike, UserError
 def write_atomic(path: PathLike, data: bytes | memoryview) -> None:
     """Write `data` so that a reader or a crash sees the old file or the new one, nothing between.
 
-    Missing directories are made; a symbolic link is replaced. Raises UserError where that fails,
-    and for a path that is there and is no regular file.
+    Missing directories are made; a symbolic link is replaced. UserError for what is no regular
+    file.
     """
     target = _checked(path)
     make_directory(target.parent)

@@ -1,8 +1,7 @@
 """`python -m edge_runtime jog`: the first moves of a vehicle whose wheels are up, one Enter each.
 
-An operator goes through STEPS. Each says what will move, waits for Enter, has the driver do it,
-measures by the vehicle's feedback, and brakes. Whatever is not as expected ends the jog with a
-stop. It calls the driver as the runtime does, within the operator's bounds and its own.
+Each of STEPS says what will move, waits for Enter, has the driver do it as the runtime would,
+measures by the vehicle's feedback, and brakes. What is not as expected ends the jog with a stop.
 """
 
 from __future__ import annotations
@@ -36,7 +35,8 @@ CONTROL_PERIOD_S, LOOK_S, HOLDS_S, SOON_S, LATER_S = 0.1, 0.02, 0.5, 1.0, 4.0
 BRAKES_S = 0.8  # a Hunter's driver locks the parking brake after 1 s
 PERSON_S, PERSON_CRAWLS_S = 30.0, 10.0  # to reach for a button
 PASSED, FAILED, NOT_TRIED = "passed", "failed", "not_tried"
-REMOTE, ESTOP, SILENCE, TURNS = "remote_control", "emergency_stop", "silence", "steering_at_a_stand"
+REMOTE, ESTOP = "remote_control", "emergency_stop"
+SILENCE, TURNS = "way_to_fall_silent", "steering_at_a_stand"
 EXAMPLE = examples("python -m edge_runtime jog --config edge.toml --out jog.json")
 Condition = Callable[[Any], Any]  # of a report
 Ask = Callable[[str, str], None]
@@ -54,8 +54,16 @@ def stands(report: Any) -> bool:
     return abs(report.speed_mps) <= STANDS_MPS
 
 
+def in_words(report: VehicleReport) -> str:
+    numbers = [f"{name} {value:.2f}" for name, value in report.action.items()]
+    battery = [] if report.battery_v is None else [f"battery {report.battery_v:.1f} V"]
+    brakes = ["brakes by itself"] if report.self_braking else []
+    told = dict.fromkeys([*report.faults, *report.standing])
+    return ", ".join([f"{report.speed_mps:.2f} m/s", *numbers, *battery, *brakes, *told])
+
+
 def bench_manifest(task: str, period_s: float) -> Manifest:
-    """Return that of a policy which no file holds, to open a driver with: +1 steers to the left."""
+    """Make a manifest to open a driver with, without a policy; +1 steers to the left."""
     return Manifest(
         task=task, observation={"frames": Entry(dtype="uint8", shape=[1])},
         action=[Action(name=name, low=-1.0, high=1.0) for name in (PEDAL, STEERING)],
@@ -66,10 +74,10 @@ def bench_manifest(task: str, period_s: float) -> Manifest:
 
 
 class Jog:
-    """Calls a driver, and looks at each of its reports.
+    """Calls a driver within the operator's bounds and its own, and looks at each of its reports.
 
-    `ask` is passed the step's name and what the operator is to do or to confirm, and raises where
-    that is not so. `left`: the sign of a steering to the left. UserError: bounds above the model's.
+    `ask` shows the operator a step's name and a text, and raises where the answer is no. `left`:
+    the sign of a steering to the left. UserError: bounds above the model's.
     """
 
     def __init__(
@@ -120,14 +128,8 @@ class Jog:
         return float(now_s - begin_s)
 
     def measured(self) -> str:
-        """Return the newest report in words."""
-        it = self.last
-        numbers = [f"{name} {value:.2f}" for name, value in it.action.items()]
-        battery = [f"battery {it.battery_v:.1f} V"] if it.battery_v is not None else []
-        brakes = ["brakes by itself"] if it.self_braking else []
-        leash = ["the leash is used up"] if self._leash.is_used(LOOK_S) else []
-        told = dict.fromkeys([*it.faults, *it.standing])
-        return ", ".join([f"{it.speed_mps:.2f} m/s", *numbers, *battery, *brakes, *leash, *told])
+        used = self._leash.is_used(LOOK_S)
+        return in_words(self.last) + (", the leash is used up" if used else "")
 
     def _action(self, drives: bool) -> Dict[str, float]:
         action = dict(self._still)
@@ -159,7 +161,6 @@ class Jog:
         self.go_on(PEDAL in self.has or None, HOLDS_S, never=nothing)
 
     def tells(self, cause: str, drives: bool, limit_s: float) -> None:
-        """Wait until the driver tells of what outranks it."""
         words = self.vehicle.outranked_by[cause]
         self.go_on(drives, limit_s, lambda it: words in it.standing, never=nothing)
 
@@ -203,7 +204,7 @@ def _steering(jog: Jog, name: str) -> str:
         jog.steering = 0.0
         jog.go_on(False, SOON_S)
         jog.stop()
-        jog.ask(name, f"they did turn to the {side}")
+        jog.ask(name, f"did they turn to the {side}?")
     return ", ".join(f"{share:.0%}" for share in shares) + " of what was asked"
 
 
@@ -213,7 +214,7 @@ def _crawl(jog: Jog, name: str) -> str:
     jog.go_on(True, CRAWLS_S, never=lambda it: it.faults or it.speed_mps < least_mps)
     measured = jog.measured()
     jog.stop()
-    jog.ask(name, "they did turn FORWARDS")
+    jog.ask(name, "did they turn FORWARDS?")
     return measured
 
 
@@ -226,10 +227,10 @@ def _stops(
 
 
 _SLOW = f"the wheels turn forwards, at {CRAWL_MPS:g} m/s at most"
-_WAITS = f"stops within {BRAKES_S:g} s, tells why, refuses; let go, it stands until a re-arm"
+_WAITS = f"stops within {BRAKES_S:g} s, tells why, and refuses a re-arm until it is let go of"
 _PRESS = "after Enter press the emergency stop within"
-_CRAWL = f"{1 - SPEED_OFF:.0%} to {OVER_CAP:.0%} of that, or of a lower cap"
-_ANGLE = f"{1 - STEERING_OFF:.0%} to {1 + STEERING_OFF:.0%} of what is asked, at most 5 degrees"
+_CRAWL = f"{1 - SPEED_OFF:.0%} to {OVER_CAP:.0%} of {CRAWL_MPS:g} m/s, or of a lower cap"
+_ANGLE = f"{1 - STEERING_OFF:.0%} to {1 + STEERING_OFF:.0%} of the angle asked, at most 5 degrees"
 # Name, what the driver needs (`Jog.has`), what moves and what the operator does, what is expected,
 # and what does it and returns what was measured; where it raises, the jog is over.
 Step = Tuple[str, Tuple[str, ...], str, str, Callable[[Jog, str], str]]
@@ -257,7 +258,10 @@ def walk(jog: Jog, rows: List[Dict[str, str]]) -> None:
     over = ""
     for name, needs, moves, expected, do in STEPS:
         lacks = [need.replace("_", " ") for need in needs if need not in jog.has]
-        result, measured = NOT_TRIED, over or ", ".join(f"the driver knows no {it}" for it in lacks)
+        result, measured = (
+            NOT_TRIED,
+            over or ", ".join(f"the driver knows of no {it}" for it in lacks),
+        )
         if not measured:
             try:
                 jog.ask(name, f"what moves: {moves}")
@@ -301,20 +305,22 @@ def run(arguments: argparse.Namespace) -> int:
     vehicle = make_vehicle(config.vehicle, tables, bench_manifest("jog", CONTROL_PERIOD_S))
     car = tables.get(vehicle.name, {}).get("car")
     left = car.get("full_steering_rad", 1.0) if isinstance(car, dict) else 1.0
-    interrupts = iter([KeyboardInterrupt])  # a second one must not keep it from its end
+    interrupted = passed = False
 
     def interrupt(number: int, frame: Any) -> None:
-        for kind in interrupts:
-            raise kind
+        nonlocal interrupted
+        if not interrupted:  # a second one must not keep it from its end
+            interrupted = True
+            raise KeyboardInterrupt
 
     with handled(ENDING_SIGNALS, interrupt):
         try:
             walk(Jog(vehicle, config.bounds, ask, left), rows)
+            passed = all(row["result"] != FAILED for row in rows)
         except KeyboardInterrupt:  # between two steps
-            rows = rows[: len(STEPS) - 1]
+            pass
         finally:
             close_in_time(vehicle)
-            passed = len(rows) == len(STEPS) and all(row["result"] != FAILED for row in rows)
             if rows:
                 write_json_out(out, {"steps": rows, "result": PASSED if passed else FAILED})
             log.close()

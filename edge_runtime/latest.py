@@ -1,8 +1,8 @@
-"""Which state is the newest of the right simulator, and how late it is.
+"""Which state is the newest of the right simulator, and how late it is. Pure: time is passed in.
 
-Pure: time is passed in. Contract, section 3: a new session is taken over only when the current
-one has been silent for 2 T. A state that is not newer than the last accepted one is rejected, and
-so is one from further ahead than any simulator can have come, unless the next state follows it.
+Contract, section 3: a new session is taken over only when the current one has been silent for 2 T.
+Rejected is what is no newer than the last accepted state, and what is further ahead than any
+simulator can have come, unless the next state follows it.
 """
 
 from __future__ import annotations
@@ -107,29 +107,26 @@ def _judge_position(
     return Rejection(reason, words)
 
 
-class _Least(NamedTuple):
-    """Of a session, in s: arrival less stamp, and the round trip (inf: none is known)."""
-
+class _Least(NamedTuple):  # of a session
     noted_s: float
-    offset_s: float
-    trip_s: float
+    offset_s: float  # arrival less stamp
+    trip_s: float  # inf: none is known
 
 
 class Freshness:
     """How late each state is, in the order of arrival, whatever the sender's clock says.
 
-    `limit_s` is the lag that is too late. Arrival less the sender's stamp is the delay plus the
-    unknown offset of two clocks. The least of a session belongs to its quickest state; what another
-    state has above it is its lag. So a backlog that a link hands over at the usual pace is seen,
-    and so is a delay that grows slowly.
+    Arrival less the sender's stamp is the delay plus the unknown offset of two clocks. The least of
+    a session belongs to its quickest state; what another state has above it is its lag. `limit_s`
+    is the lag that is too late. So a backlog is seen that comes at the usual pace, and a delay that
+    grows.
 
     A step of the sender's clock looks like a lag, and counts as one until there is a safe stop.
-    Then the round trip of a command and the next state shows whether a backlog is left. It needs no
-    offset: each of the two clocks is read twice (`heard_sent_ns`, `heard_ns` of the wire). Two
-    things cannot be told apart: a clock set ahead and a backlog of just that size; a clock set back
-    and a delay that has moved from the commands to the states. Where the stamps show no lag,
-    `limit_s` of a round trip may be the command's: over jitter both ways it would else stay in a
-    stop for good.
+    Then the round trip of a command and the next state, which needs no offset, shows whether a
+    backlog is left. Two things cannot be told apart: a clock set ahead and a backlog of just that
+    size; a clock set back and a delay that has moved from the commands to the states. Where the
+    stamps show no lag, `limit_s` of a round trip may be the command's: else jitter both ways would
+    stop it for good.
     """
 
     def __init__(self, limit_s: float) -> None:

@@ -130,7 +130,6 @@ class Link:
             log.event("error", "not_sent", topic=topic, detail=error)
 
     def refusal(self, now_s: float) -> Optional[Rejection]:
-        """Say why no state of this Unix time is taken, whatever it holds."""
         return self.listener.refusal(now_s) if self.listener else None
 
     def close(self) -> None:
@@ -145,9 +144,8 @@ class Link:
 def _at_once(callback: Callable[[zenoh.Sample], None]) -> Any:
     """Let Zenoh's own thread call: no second thread to wake, and no queue of old states between.
 
-    The callback must be quick, for nothing else is received meanwhile. A native thread that calls
-    into Python builds a Python state and takes it down for each call: tens of microseconds. One
-    PyGILState_Ensure that is never released keeps it, as long as the thread and its session live.
+    The callback must be quick. A native thread that calls into Python builds a Python state for
+    each call, in tens of microseconds. One PyGILState_Ensure that is never released keeps it.
     """
     thread = threading.local()
 
@@ -185,9 +183,8 @@ def taken(vehicle_id: str) -> UserError:
 class Presence:
     """Declares the tokens, and again whenever the routers that this session sees have changed.
 
-    Zenoh 1.5 (the board's) does not tell a router that comes later of a token declared before.
-    It has a thread of its own, because all of this may wait for the network and the watchdog
-    must not. `give_way` is called where an elder claim than this one's is found.
+    Zenoh 1.5 (the board's) does not tell a router that comes later of a token declared before. It
+    may wait for the network, in a thread of its own; `give_way` is called for an elder claim.
     """
 
     def __init__(
@@ -234,7 +231,6 @@ class Presence:
             self._give_way()
 
     def undeclare(self) -> None:
-        """Stop looking and take the tokens away."""
         self._stopping.set()
         if self.thread.is_alive() and self.thread is not threading.current_thread():
             self.thread.join(_JOIN_S)
@@ -331,14 +327,12 @@ class _Way:
         self.newest = -1
 
     def note(self, number: int, came: int = 1) -> None:
-        """Count `came` messages up to this number."""
         self.sent += number - self.newest
         self.came += came
         self.newest = number
         self.counts.append((self.sent, self.came))
 
     def lost_percent(self) -> float:
-        """Share of the messages in the window that did not come."""
         (sent, came), (all_sent, all_came) = self.counts[0], self.counts[-1]
         return 100.0 * max(1.0 - (all_came - came) / max(all_sent - sent, 1), 0.0)
 

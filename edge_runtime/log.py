@@ -1,7 +1,6 @@
 """Log to stderr, one line an event: time, level, event, then its fields.
 
-A thread of its own writes the lines, so that a stalled reader of stderr cannot hold the thread that
-drives.
+A thread writes the lines, so that a stalled reader cannot hold the thread that drives.
 """
 
 from __future__ import annotations

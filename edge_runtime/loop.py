@@ -75,7 +75,6 @@ class ControlLoop:
         self._worker = threading.Thread(target=self._work, name="policy", daemon=True)
 
     def start(self) -> None:
-        """Begin to listen; call `run` next."""
         self._worker.start()
         if self._vehicle is not None:
             self._vehicle.on_fault = self._wake_watchdog
@@ -119,7 +118,6 @@ class ControlLoop:
         return not self._worker.is_alive()
 
     def has_heard(self) -> bool:
-        """Return whether any state has come, also one that was rejected."""
         return bool(self._latest.accepted or self._latest.rejected)
 
     def health(self) -> Health:

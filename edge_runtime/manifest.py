@@ -1,7 +1,6 @@
 """The manifest of a policy file: its task, observation and action. Contract, section 4.
 
-A Task is what an environment asks of a policy; a Manifest is a Task and where the policy comes
-from. The control period T, the size of a state and the safe stop follow from it.
+The control period T, the size of a state and the safe stop follow from the task.
 """
 
 from __future__ import annotations

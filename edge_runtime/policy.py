@@ -54,8 +54,7 @@ class Policy(NamedTuple):
     def act(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
         """Infer the action, float32 [n], from the arrays of `layout`. It may hold NaN: check it.
 
-        Raises UserError for another type or shape, which can depend on the observation, and
-        whatever onnxruntime raises.
+        Raises UserError for another type or shape, and whatever onnxruntime raises.
         """
         inputs = {name: array[np.newaxis] for name, array in observation.items()}
         with _flushed():
@@ -71,8 +70,7 @@ def load_policy(
     """Load a policy that may drive: trusted, whole and probed, with a manifest that fits its graph.
 
     `public_key` is a PEM file; without it `keys/policy.pub` is taken where it exists, and with
-    `allow_unsigned` before it a `policy.pub` beside the policy.
-    Raises UserError with the first reason why the policy may not drive.
+    `allow_unsigned` before it a `policy.pub` beside the policy. Raises UserError.
     """
     # Read once: what is verified is what is loaded, even if the file is replaced meanwhile.
     data = read_bytes(path, "policy file", MAX_POLICY_MIB)
@@ -188,7 +186,6 @@ def probes(layout: Layout) -> Iterator[dict[str, np.ndarray]]:
 
 
 def _probe(policy: Policy) -> None:
-    """Warm the network up and check its answers. Raises UserError."""
     for seen in probes(policy.layout):
         try:
             action = policy.act(seen)
@@ -245,9 +242,8 @@ def check_trust(
     """Return VERIFIED, BESIDE, UNVERIFIED or UNSIGNED, and the file of the key that verified.
 
     A signature is always verified where a key is known: `allow_unsigned` lets through only what
-    cannot be verified. With it a key beside the policy comes before that of the working directory;
-    without it such a key counts for nothing, because whoever brings a policy could bring it, too.
-    Raises UserError where the policy may not drive.
+    cannot be verified. Without it a key beside the policy counts for nothing, because whoever
+    brings a policy could bring it, too. Raises UserError where the policy may not drive.
     """
     signature_path = Path(f"{path}{SIGNATURE_SUFFIX}")
     if not signature_path.exists():
@@ -379,7 +375,6 @@ def _fields(message: Any) -> dict[int, Any]:
 
 
 def _varint(message: memoryview, position: int) -> tuple[int, int]:
-    """Read a number; returns it and where it ends."""
     result = 0
     for index, byte in enumerate(message[position : position + 10]):
         result |= (byte & 0x7F) << (7 * index)

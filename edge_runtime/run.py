@@ -55,11 +55,10 @@ def drive(
 ) -> bool:
     """Verify a policy, connect, drive until a signal comes or `until` is set: `run`, from Python.
 
-    `vehicle` is a driver, or what `--vehicle` takes; a driver is closed in the end. `config` is a
-    TOML file; `settings` are its other keys (`config.example.toml`), and win over it. Signals end
-    it in the main thread only. Returns False where a thread hangs and would hold the interpreter's
-    exit. Raises UserError where it cannot begin, and where it gave way to another runtime of the
-    same vehicle id; KeyboardInterrupt for a signal before the drive.
+    `vehicle` is a driver, which is closed in the end, or what `--vehicle` takes. `config` is a TOML
+    file; `settings` are its other keys, and win over it. Signals end it in the main thread only.
+    Returns False where a thread hangs and would hold the interpreter's exit. Raises UserError where
+    it cannot begin, and where it gave way to another runtime of the same vehicle id.
     """
     driver = None if vehicle is None or isinstance(vehicle, str) else vehicle
     flags = {"policy": policy and str(policy), "connect": connect, **settings}

@@ -1,9 +1,8 @@
 """`python -m edge_runtime sense`, or `bridge sense`: a robot's own senses in the simulator's place.
 
-A source is a class with `observe()`, which returns an array for each entry of the policy's
-manifest, taken after it was called. What is too old is not sent, and any other fault ends the
-command: no state comes, and the edge runtime stops by its own rule, as if the cable had been
-pulled. It runs on the board with the board's libraries alone.
+A source has `observe()`, which returns an array, taken after it was called, for each entry of the
+policy's manifest. What is too old is not sent. Any other fault ends the command: no state comes,
+and the edge runtime stops as if the cable had been pulled. The board's libraries are enough.
 """
 
 from __future__ import annotations
@@ -12,26 +11,21 @@ import argparse
 import contextlib
 import math
 import queue
-import secrets
 import sys
 import threading
 import time
-from importlib import import_module
-from typing import Any, Callable, Dict, Iterator, List, Mapping, NamedTuple, Optional, Tuple
+from typing import Any, Callable, Dict, Mapping, NamedTuple, Optional
 
 import msgspec
 import numpy as np
-import zenoh
 
-from edge_runtime import tls as access
-from edge_runtime import wire
+from edge_runtime import transport, wire
 from edge_runtime.cli import examples, sigterm_as_interrupt
 from edge_runtime.config import add_flags, add_trust
 from edge_runtime.manifest import Layout, Task
 from edge_runtime.policy import load_manifest
 from edge_runtime.safety import SILENCE_PERIODS, Event
-from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint, only_own, open_session, tls_for
-from edge_runtime.util import UserError, printable
+from edge_runtime.util import UserError, load_named
 from edge_runtime.wire import Command, Rejection, State
 
 SOURCE_FAILED = 1  # exit status
@@ -45,7 +39,7 @@ _POLL_S = 0.1  # a signal that another thread got wakes nobody: so it polls
 EXAMPLE = examples("python -m edge_runtime sense --source my_camera:Camera --policy my.onnx")
 
 
-class SourceError(Exception):
+class SourceError(UserError):
     """What is wrong with the source."""
 
 
@@ -85,9 +79,8 @@ def pack(task: Task, seen: Any) -> Dict[str, bytes]:
 class Intake:
     """Judges what a source says, and makes the states of one session of it; monotonic times.
 
-    A state is stamped with the moment at which the source was asked. The answer may take 2.2 T, as
-    long as the edge runtime answers a state, but more than T only once in a row: the policy is made
-    for T.
+    A state is stamped with the moment at which the source was asked. The answer may take 2.2 T (so
+    long the edge runtime answers a state), but not twice in a row more than T.
     """
 
     def __init__(self, task: Task, session: str, zero_ns: int) -> None:
@@ -157,7 +150,7 @@ class _Source:
                 said = self._said.get(timeout=min(max(left_s, 0.0), _POLL_S))
                 if isinstance(said, BaseException):
                     name = "" if isinstance(said, SourceError) else f"{type(said).__name__}: "
-                    raise SourceError(printable(" ".join(f"{name}{said}".split())))
+                    raise SourceError(f"{name}{said}")
                 return said
             if left_s <= 0.0:
                 return None
@@ -172,39 +165,6 @@ class _Source:
             self._said.put(error)
 
 
-class _End:
-    """The simulator's end of the wire: what is sent, and what the edge runtime says to it."""
-
-    def __init__(self, session: zenoh.Session, vehicle_id: str, task: Task) -> None:
-        self.session = secrets.token_hex(8)
-        self.told: Tuple[str, str] = ("", "")  # mode and reason of the newest command
-        self._task = msgspec.structs.asdict(task)
-        drop, own = zenoh.CongestionControl.DROP, wire.key(vehicle_id, "command")
-        self._states, self._scenes = (
-            session.declare_publisher(f"phil/{vehicle_id}/{topic}", congestion_control=drop)
-            for topic in ("state", "scene")
-        )
-        self._declared: List[Any] = [
-            session.liveliness().declare_token(f"phil/{vehicle_id}/simulator"),
-            session.declare_subscriber(own, only_own(own, self._hear)),
-        ]
-
-    def send(self, state: State) -> None:
-        """Publish a state, and for viewers how it is to be read."""
-        place = {name: getattr(state, name) for name in ("episode", "step", "sim_time_s")}
-        self._scenes.put(msgspec.msgpack.encode({**place, "task": self._task}))
-        self._states.put(wire.encode(state))
-
-    def close(self) -> None:
-        for declared in [*self._declared, self._states, self._scenes]:
-            declared.undeclare()
-
-    def _hear(self, sample: zenoh.Sample) -> None:
-        command = wire.decode_command(bytes(sample.payload))
-        if isinstance(command, Command) and command.session == self.session:
-            self.told = (command.mode, command.reason)
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     place = "the source: a class with observe() -> {entry: array}; may have speed_mps, episode_over"
@@ -213,9 +173,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--policy", metavar="POLICY.onnx", type="path", required=True, help=says)
     add_trust(parser)
     where = parser.add_mutually_exclusive_group()
-    form: Any = {"metavar": "PROTOCOL/HOST:PORT", "type": check_endpoint}
-    here = f"endpoint on which edge runtimes and viewers connect (default: {DEFAULT_ENDPOINT})"
-    where.add_argument("--listen", **form, default=DEFAULT_ENDPOINT, help=here)
+    form: Any = {"metavar": "PROTOCOL/HOST:PORT", "type": transport.check_endpoint}
+    here = "endpoint on which edge runtimes and viewers connect"
+    where.add_argument("--listen", **form, default=transport.DEFAULT_ENDPOINT, help=here)
     where.add_argument("--connect", **form, help="connect to this router instead of listening")
     add_flags(parser, "tls", "vehicle_id")
 
@@ -223,19 +183,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Send what the source observes until ^C, or until it fails (status 1)."""
     asked, vehicle_id = arguments, arguments.vehicle_id or wire.DEFAULT_VEHICLE_ID
-    tls = tls_for(asked.tls, asked.connect or asked.listen)
+    tls = transport.tls_for(asked.tls, asked.connect or asked.listen)
     manifest = load_manifest(asked.policy, asked.public_key, asked.allow_unsigned)
     task = Task(**{name: getattr(manifest, name) for name in Task.__struct_fields__})
     with sigterm_as_interrupt():  # and so afterwards, whatever the import does to signals
-        make = _load(asked.source)
-    with sigterm_as_interrupt(), _open(asked, vehicle_id, task, tls) as end:
+        make = load_named(asked.source, "source")
+    place = (asked.listen, vehicle_id, tls, asked.connect)
+    opened = transport.open_simulator(transport.SimulatorEnd, *place)
+    with sigterm_as_interrupt(), opened as end:
         try:
             source = _Source(make, task)
             # The first one is not sent: a camera takes its time to open.
             while source.answer(time.monotonic() + TELLS_S) is None:
                 print(f"waiting: {asked.source} has observed nothing yet", flush=True)
             print(f"ready vehicle_id={vehicle_id} source={asked.source}", flush=True)
-            _sense(source, end, task, tls)
+            _sense(source, end, task)
         except SourceError as error:
             # At once, before anything is closed: nothing is sent any more.
             stops = f"{error}; nothing is sent any more, so the vehicle stops"
@@ -243,14 +205,20 @@ def run(arguments: argparse.Namespace) -> int:
     return SOURCE_FAILED
 
 
-def _sense(source: _Source, end: _End, task: Task, tls: Optional[access.TlsFiles]) -> None:
+def _sense(source: _Source, end: transport.SimulatorEnd, task: Task) -> None:
     """Send a state each period until the source fails: SourceError."""
     intake = Intake(task, end.session, time.time_ns() - time.monotonic_ns())
-    said, next_s, sent_s = end.told, time.monotonic(), time.monotonic()
+    told = [("", "")]  # mode and reason of the newest command
+
+    def hear(payload: bytes) -> None:
+        command = wire.decode_command(payload)
+        if isinstance(command, Command) and command.session == end.session:
+            told[0] = command.mode, command.reason
+
+    end.hear("command", hear)
+    said, next_s, sent_s = told[0], time.monotonic(), time.monotonic()
     while True:
         time.sleep(max(0.0, next_s - time.monotonic()))
-        if tls is not None:
-            tls.require_valid(time.time())
         asked_s = time.monotonic()
         next_s = max(next_s + task.control_period_s, asked_s)
         source.ask()
@@ -261,34 +229,12 @@ def _sense(source: _Source, end: _End, task: Task, tls: Optional[access.TlsFiles
         if (state := intake.take(seen, asked_s, now_s)) is None:
             print(f"too old: observe() took {now_s - asked_s:.2f} s; it is not sent", flush=True)
         else:
-            end.send(state)
+            place = {name: getattr(state, name) for name in ("episode", "step", "sim_time_s")}
+            end.scenes.put(msgspec.msgpack.encode({**place, "task": task}))  # for viewers
+            end.publish_state(wire.encode(state))
             sent_s = now_s
-        if end.told != said:
-            said = end.told
+        if told[0] != said:
+            said = told[0]
             print(f"the edge runtime says {' '.join(said).strip()}", flush=True)
         if said[1] == Event.OTHER_TASK.value:
             raise UserError(f"the edge runtime's policy is for another task than {task.task!r}")
-
-
-def _load(place: str) -> Callable[[], Any]:
-    """Import `module:Class`. Raises UserError."""
-    module, _, member = place.partition(":")
-    try:
-        return getattr(import_module(module), member)
-    except (Exception, SystemExit) as error:  # a module may raise anything when it is imported
-        raise UserError(f"no source {place!r}: {type(error).__name__}: {error}") from None
-
-
-@contextlib.contextmanager
-def _open(
-    asked: argparse.Namespace, vehicle_id: str, task: Task, tls: Optional[access.TlsFiles]
-) -> Iterator[_End]:
-    """Connect, or listen, as a simulator does. Raises UserError."""
-    listens = asked.connect is None
-    rules = None if tls is None else access.rules_for_simulator(tls, vehicle_id, listens)
-    if asked.connect is not None:
-        session = open_session(connect=asked.connect, mode="client", tls=tls)
-    else:
-        session = open_session(listen=asked.listen, mode="router", tls=tls, access=rules)
-    with session, contextlib.closing(_End(session, vehicle_id, task)) as end:
-        yield end

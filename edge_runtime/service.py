@@ -83,6 +83,5 @@ class BoardWatch:
 
 
 def quantiles_ms(durations_ns: Collection[int]) -> Dict[str, float]:
-    """p50, p99 and max in milliseconds; zeros where there are no durations."""
     p50, p99, top = np.percentile(np.array([*durations_ns] or [0]) / 1e6, [50, 99, 100])
     return {"p50": float(p50), "p99": float(p99), "max": float(top)}

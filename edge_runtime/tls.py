@@ -1,10 +1,8 @@
 """Certificates, private keys, and what each party may say and hear.
 
-`ca.pem`, `cert.pem` and `key.pem` are checked before a session is opened, because Zenoh's own
-message for any fault in them is "Unable to connect". ROLES is the table of rights, by the common
-name of the certificate. Zenoh filters only in the process that holds the configuration: the
-simulator or router that listens, and each edge runtime for what comes to it. A refused message is
-dropped without a word to its sender.
+The files are checked before a session is opened: Zenoh says only "Unable to connect". ROLES is the
+table of rights, by the certificate's common name. Zenoh filters, without a word, only in the
+process that holds the rules: the simulator or router that listens, and each edge runtime.
 """
 
 from __future__ import annotations

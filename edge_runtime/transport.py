@@ -7,17 +7,22 @@ Behind a router of its own the simulator is a `client`, too: two peers would not
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
+import secrets
 import shlex
+import time
+from functools import partial
 from pathlib import Path
-from typing import Any, Callable, Dict, List, Optional, Sequence, Union
+from typing import Any, Callable, Dict, Iterator, List, Optional, Sequence, Type, TypeVar, Union
 
 import zenoh
 
 from edge_runtime.reach import why_no_link
-from edge_runtime.tls import EDGE, OPERATOR, TlsFiles, common_name, load_tls
+from edge_runtime.tls import EDGE, OPERATOR, TlsFiles, common_name, load_tls, rules_for_simulator
 from edge_runtime.util import PathLike, UserError
+from edge_runtime.wire import key
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
@@ -25,6 +30,7 @@ DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 LEASE_MS = 1000
 # Back within 1 s of a link's return leaves 0.5 s for this: five fresh states take the rest.
 RETRY = {"period_init_ms": 100, "period_max_ms": 200, "period_increase_factor": 1.5}
+RETRY_S = 0.1
 
 _ENDPOINT = re.compile(r"(tcp|udp|tls)/(\[[0-9A-Fa-f:.]+\]|[^\s\[\]/:]+):(\d{1,5})")
 
@@ -129,22 +135,97 @@ def _settings(
     return rows
 
 
-def only_own(key: str, hear: Callable[[zenoh.Sample], None]) -> Callable[[zenoh.Sample], None]:
+def connect_client(endpoint: str, wait_s: float, tls: Optional[TlsFiles] = None) -> zenoh.Session:
+    """Open a client, trying again for `wait_s`: both ends are often started together."""
+    give_up_s = time.monotonic() + wait_s
+    while True:
+        try:
+            return open_session(connect=endpoint, mode="client", tls=tls)
+        except UserError:
+            if time.monotonic() >= give_up_s:
+                raise
+            time.sleep(RETRY_S)
+
+
+def only_own(own: str, hear: Callable[[zenoh.Sample], None]) -> Callable[[zenoh.Sample], None]:
     """Make a callback that drops what was put to `phil/*/state` and the like, not to this key."""
 
     def take(sample: zenoh.Sample) -> None:
-        if str(sample.key_expr) == key:
+        if str(sample.key_expr) == own:
             hear(sample)
 
     return take
 
 
-def pasted(words: str, role: str, endpoint: str, vehicle_id: str, tls: Optional[TlsFiles]) -> str:
+class SimulatorEnd:
+    """The simulator's end of the wire: of `bridge simulate`, and of `sense` in its place."""
+
+    def __init__(
+        self, session: zenoh.Session, vehicle_id: str, tls: Optional[TlsFiles] = None
+    ) -> None:
+        self.vehicle_id, self.session = vehicle_id, secrets.token_hex(8)
+        self._zenoh, self._tls = session, tls
+        # DROP: a slow listener must never hold up the simulation.
+        drop = zenoh.CongestionControl.DROP
+        self._states, self.scenes = (
+            session.declare_publisher(f"phil/{vehicle_id}/{topic}", congestion_control=drop)
+            for topic in ("state", "scene")
+        )
+        token = session.liveliness().declare_token(f"phil/{vehicle_id}/simulator")
+        self._declared: List[Any] = [self._states, self.scenes, token]
+
+    def hear(self, topic: str, handler: Callable[[bytes], None]) -> None:
+        """Call `handler(payload)`, which must be quick, for every message of the topic."""
+        own = key(self.vehicle_id, topic)
+        take = only_own(own, lambda sample: handler(sample.payload.to_bytes()))
+        self._declared.append(self._zenoh.declare_subscriber(own, take))
+
+    def publish_state(self, payload: bytes) -> None:
+        """Send an encoded state to the edge runtime (and to viewers); UserError once expired."""
+        if self._tls is not None:
+            self._tls.require_valid(time.time())
+        self._states.put(payload)
+
+    def close(self) -> None:
+        """Undeclare everything: a callback left open hangs the process at its end."""
+        for declared in reversed(self._declared):
+            declared.undeclare()
+
+
+_End = TypeVar("_End", bound=SimulatorEnd)
+
+
+@contextlib.contextmanager
+def open_simulator(
+    kind: Type[_End],
+    listen: Optional[str],
+    vehicle_id: str,
+    tls: Optional[TlsFiles] = None,
+    connect: Optional[str] = None,
+    wait_s: float = 0.0,
+) -> Iterator[_End]:
+    """Listen at `listen` for the edge runtime, or share the router at `connect` with others.
+
+    With `tls`, every other party has the rights of its certificate's name and no more, by the
+    listener or router. UserError if the port is busy, or if no router answers within `wait_s`.
+    """
+    rules = None if tls is None else rules_for_simulator(tls, vehicle_id, connect is None)
+    # Behind a router a client: two peers there would not hear one another.
+    if connect is not None:
+        session = connect_client(connect, wait_s, tls)
+    else:
+        session = open_session(listen=listen, mode="router", tls=tls, access=rules)
+    with session, contextlib.closing(kind(session, vehicle_id, tls)) as end:
+        yield end
+
+
+def pasted(
+    words: str, role: str, endpoint: str, vehicle_id: str, tls: Optional[TlsFiles] = None
+) -> str:
     """Return a command for another shell of this machine, as that role.
 
     Loopback stands for an endpoint that listens at every address; over TLS Zenoh connects to no
-    `[::1]`. Certificates are looked for beside `tls`, our own, and else are where `deploy certs`
-    makes them.
+    `[::1]`. Certificates lie beside `tls`, our own, or else where `deploy certs` makes them.
     """
     place = endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/localhost:")
     given = ["--connect", place, "--vehicle-id", vehicle_id]
@@ -155,11 +236,5 @@ def pasted(words: str, role: str, endpoint: str, vehicle_id: str, tls: Optional[
     return f"python -m edge_runtime {words} {' '.join(map(shlex.quote, given))}"
 
 
-def rearm_command(endpoint: str, vehicle_id: str, tls: Optional[TlsFiles] = None) -> str:
-    """Return what an operator types to let a vehicle drive again."""
-    return pasted("rearm", OPERATOR, endpoint, vehicle_id, tls)
-
-
-def run_command(endpoint: str, vehicle_id: str, tls: Optional[TlsFiles] = None) -> str:
-    """Return how to start an edge runtime, once the reader has put in the policy's name."""
-    return pasted("run --policy POLICY.onnx", EDGE, endpoint, vehicle_id, tls)
+rearm_command = partial(pasted, "rearm", OPERATOR)
+run_command = partial(pasted, "run --policy POLICY.onnx", EDGE)  # the reader names the policy

@@ -9,6 +9,7 @@ import json
 import os
 import shlex
 import threading
+from importlib import import_module
 from pathlib import Path
 from typing import Any, BinaryIO, Callable, Dict, Union
 
@@ -67,7 +68,6 @@ def read_bytes(path: PathLike, what: str, most_mib: int = MAX_FILE_MIB) -> bytes
 
 
 def read_json(path: PathLike, what: str) -> Dict[str, Any]:
-    """Read the object in a JSON file. Raises UserError where there is none."""
     return parse_json(read_bytes(path, what), f"{what} {path}")
 
 
@@ -90,6 +90,15 @@ def read_toml(path: PathLike, what: str) -> Dict[str, Any]:
         return dict(msgspec.toml.decode(read_bytes(path, what)))
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise UserError(f"{what} {path} is no TOML: {error}") from None
+
+
+def load_named(place: str, what: str) -> Any:
+    """Import `module:name`; UserError where that fails: a module may raise anything."""
+    module, _, name = place.partition(":")
+    try:
+        return getattr(import_module(module), name)
+    except (Exception, SystemExit) as error:
+        raise UserError(f"no {what} {place!r}: {type(error).__name__}: {error}") from error
 
 
 def ends_within(limit_s: float, call: Callable[[], Any]) -> bool:

@@ -28,7 +28,7 @@ def watch(look: Callable[[], Status], first: Status) -> None:
 
 
 def render(status: Status) -> List[str]:
-    """Return a line for each thing, at most some 40 characters wide."""
+    """Return a line for each thing; apart from faults at most 50 characters wide."""
     told, command = (status.get(topic) or {} for topic in ("feedback", "command"))
     names = [row["name"] for row in status["manifest"]["action"]]
     speed = f"{_number(told.get('speed_mps'), 'm/s')} of {_number(told.get('commanded_speed_mps'))}"

@@ -105,7 +105,7 @@ class Command(msgspec.Struct, frozen=True, kw_only=True):
     """The answer to the state (session, episode, step); it is its own heartbeat.
 
     `received_ns` and `sent_ns` are the edge's wall clock, `inference_ns` is a duration. `plan`
-    holds the actions of the next periods, for as long as nothing newer comes; mostly left out.
+    holds the actions of the next periods, where nothing newer comes; mostly left out.
     """
 
     session: str
@@ -125,10 +125,9 @@ class Command(msgspec.Struct, frozen=True, kw_only=True):
 class Feedback(msgspec.Struct, frozen=True, kw_only=True):
     """What the vehicle does. `action` is what the actuators have reached, not what was asked.
 
-    `episode` and `step` are those of the last command taken (-1 before the first one). `speed_mps`
-    is the vehicle's own, and so is `commanded_speed_mps`, which a vehicle that takes a speed is
-    asked for now. `scenario_speed_mps` is that of the scenario's car by the similarity. What the
-    driver does not know is None.
+    `episode` and `step` are those of the last command taken (-1 before the first). `speed_mps` and
+    `commanded_speed_mps`, what it is asked for now, are its own; `scenario_speed_mps` is that of
+    the scenario's car. What the driver does not know is None.
     """
 
     vehicle: str
@@ -150,12 +149,11 @@ class Feedback(msgspec.Struct, frozen=True, kw_only=True):
 class Health(msgspec.Struct, frozen=True, kw_only=True):
     """The state of the edge runtime, twice a second.
 
-    `inference_ms` and `command_ms` (from a state's arrival to its command's sending) hold p50,
-    p99 and max over the last 1,024 (0 before the first). `superseded` counts accepted states that
-    a newer one replaced before the policy took them, `rivals` other runtimes with this vehicle id.
-    `temperature_c` is the board's hottest sensor, None where it has none. `vehicle_fault` says in
-    words what is wrong with the vehicle, or what has stopped it and waits for a re-arm. `link` is
-    `LinkQuality.measured`. The operator's bounds of the vehicle follow; None where none is set.
+    `inference_ms` and `command_ms` (from a state's arrival to its command's sending) hold p50, p99
+    and max over the last 1,024. `superseded` counts accepted states that the policy never took,
+    `rivals` other runtimes with this vehicle id. `temperature_c` is the board's hottest sensor.
+    `vehicle_fault` says what is wrong with the vehicle, or what has stopped it. `link` is
+    `LinkQuality.measured`. The operator's bounds follow. What is not known, or not set, is None.
     """
 
     vehicle_id: str

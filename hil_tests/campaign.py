@@ -1,9 +1,7 @@
 """``python -m hil_tests campaign``: every fault, and every network of the axes, in one report.
 
-The report is JSON, and beside it Markdown for people, with a table for each part and a picture.
-Along each axis one thing about the network gets worse, each way. Every network is driven with the
-same seeds, in virtual time. The budget is the largest value of each axis up to which the policy
-holds a share of successes.
+The report is JSON, Markdown and a picture. Along each axis one thing about the network gets worse,
+each way, with the same seeds and in virtual time.
 """
 
 from __future__ import annotations
@@ -98,10 +96,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def choose(names: str | None, only: str | None) -> tuple[list[Axis], list[Row]]:
-    """Return the latency axes and the faults of these names or patterns (``hunter_*``), in order.
-
-    Raises UserError where a name fits none.
-    """
+    """Return the axes and faults of these names or patterns (``hunter_*``); UserError for none."""
     axes, faults = AXES if only != "faults" else (), ROWS if only != "latency" else ()
     known, chosen = [row.name for row in (*axes, *faults)], set[str]()
     for name in names.split(",") if names else ["*"]:

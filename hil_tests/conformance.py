@@ -17,7 +17,7 @@ from edge_runtime import log
 from edge_runtime.cli import examples
 from edge_runtime.config import NONE, load_config
 from edge_runtime.files import check_writable, write_json_out
-from edge_runtime.jog import bench_manifest
+from edge_runtime.jog import bench_manifest, in_words
 from edge_runtime.util import UserError, printable
 from edge_runtime.vehicles import make_vehicle
 from edge_runtime.vehicles.base import Vehicle, VehicleReport, close_in_time
@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         for rule, is_kept in RULES.items():
             try:
-                wrong = "" if is_kept(bench) else in_words(bench.last)
+                wrong = "" if is_kept(bench) else f"last report: {in_words(bench.last)}"
             # A driver may raise anything, and the next rule is due.
             except (Exception, SystemExit) as error:
                 wrong = f"{type(error).__name__}: {error}"
@@ -69,14 +69,6 @@ def run(arguments: argparse.Namespace) -> int:
     return 0 if kept == len(RULES) else 1
 
 
-def in_words(report: VehicleReport | None) -> str:
-    if report is None:
-        return "it has not reported yet"
-    told = {**report._asdict(), **report.action, "faults": "; ".join(report.faults), "action": None}
-    words = (f"{name} {value}" for name, value in told.items() if value is not None)
-    return f"last report: {', '.join(words)}"
-
-
 class Bench:
     """Calls a driver as the runtime does, times the calls and keeps the last report."""
 
@@ -85,10 +77,9 @@ class Bench:
         vehicle.control_period_s = period_s
         self.go = {name: limit.high for name, limit in vehicle.limits.items()}
         self.longest_s, self.well_formed = 0.0, True
-        self.last: VehicleReport | None = None
+        self.last = VehicleReport({}, 0.0, True, [])
 
     def call(self, name: str, *arguments: Any, **options: Any) -> Any:
-        """Call the driver with the time, and with a command's speed."""
         now_s = time.monotonic()
         more = {"command": (now_s, None), "close": ()}.get(name, (now_s,))
         try:
@@ -132,7 +123,6 @@ class Bench:
         return self.until(moves=False) and self.goes()
 
     def waits(self) -> bool:
-        """Return whether it stands after `enable`, until a command comes."""
         self.call("enable")
         return not self.until(moves=True, limit_s=0.5)
 
@@ -142,7 +132,6 @@ class Bench:
         return bool(self.report(periods * self.period_s).self_braking)
 
     def brakes(self) -> bool:
-        """Return whether it gets slower within 2 T of a stop, and then stands."""
         self.call("brake")
         # Commands still come: without them it would brake by itself.
         if self.until(moves=False, limit_s=2 * self.period_s + LATE_S, commands=True):
@@ -162,7 +151,6 @@ class Bench:
         return True
 
     def stays_within(self) -> bool:
-        """Return whether its actuators stay within the limits, when far more is asked."""
         for _ in range(10):
             self.call("command", {name: 10.0 * value for name, value in self.go.items()})
             action = self.report(self.period_s / 2).action

@@ -75,10 +75,7 @@ def train(folder: Path) -> None:
 
 
 def drive(folder: Path, trust: tuple[str, ...]) -> dict[str, dict[str, Any]]:
-    """Drive the same episodes in process, over the wire, over a slow wire; then record.
-
-    Return the reports of the first three, under their names.
-    """
+    """Drive the same episodes in process, over the wire and over a slow one (reports); record."""
 
     def simulate(name: str, runs: int, clock: str, latency: str, *view: object) -> dict[str, Any]:
         out, endpoint, us = folder / f"{name}.json", free_endpoint(), ("--vehicle-id", VEHICLE_ID)
@@ -110,7 +107,6 @@ def drive(folder: Path, trust: tuple[str, ...]) -> dict[str, dict[str, Any]]:
 
 
 def drives_table(reports: dict[str, dict[str, Any]]) -> str:
-    """Make a row for each report, under its name; latency from state sent to command received."""
     rows = []
     for name, report in reports.items():
         distance, latency = report["surviving_distance_m"], report.get("latency_ms")

@@ -73,7 +73,6 @@ Drive = Callable[[LatencySpec, Sequence[int]], Sequence[bool]]
 
 
 def network(at: Point) -> LatencySpec:
-    """Return the network of a point, the same each way."""
     delay_ms, jitter_ms, tail_ms, loss, burst, outage_s = (at.get(name, 0.0) for name in AXES)
     spread_ms, has_bursts = jitter_ms or tail_ms, burst >= 1.0
     every = f"s/{OUTAGE_EVERY_S:g}s@{OUTAGE_START_S:g}s"
@@ -109,7 +108,6 @@ class SequentialTest:
         self.drives = self.successes = 0
 
     def add(self, success: bool) -> str | None:
-        """Count a drive; return the verdict, None while there is none."""
         self.drives += 1
         self.successes += success
         for which, verdict in enumerate((HOLDS, BREAKS)):
@@ -122,10 +120,9 @@ class SequentialTest:
 
 
 class Search:
-    """Looks for edges, and keeps the verdict of every point that was tried.
+    """Looks for edges, and hands the verdict of every point that was tried to ``keep``.
 
-    ``drive`` is called with the next AT_ONCE seeds, from ``seed`` on, until a point is decided, and
-    ``keep`` after it.
+    ``drive`` is called with the next AT_ONCE seeds, from ``seed`` on, until a point is decided.
     """
 
     def __init__(
@@ -136,7 +133,6 @@ class Search:
         self.edges: dict[str, dict[str, Any]] = {}
 
     def verdict(self, at: Point) -> str:
-        """Drive a point until it is decided; return HOLDS, BREAKS or BETWEEN."""
         spec = network(at)
         if str(spec) not in self.tried:
             test, verdict = SequentialTest(self._promise), None
@@ -248,10 +244,7 @@ class UntoldError(UserError):
 
 
 class Drivers(ProcessPoolExecutor):
-    """A pool of processes, each with an environment and the policy; 0 jobs: one a core.
-
-    Raises UserError where the policy does not load or the environment cannot be made.
-    """
+    """Processes, each with an environment and the policy; 0 jobs: one a core. UserError."""
 
     def __init__(self, policy: str, env: str, condition: str, public_key: str | None, jobs: int):
         policy = located(policy)

@@ -36,10 +36,9 @@ class CommandTimeoutError(UserError, TimeoutError):
 class Process:
     """``python -m ARGUMENTS`` beside us. It ends with the block, and the thread that started it.
 
-    ``lines`` are its output of both streams with their monotonic times; ``output`` and ``errors``
-    are the text of each stream. With ``ready``, a text, the constructor waits until that is
-    printed; UserError where it never is. ``shown`` prints the command; ``environment`` holds
-    variables beside ours, ``options`` further ones of Popen.
+    ``lines`` are its output with monotonic times; ``output`` and ``errors`` the text of each
+    stream. The constructor waits until the text ``ready`` is printed; UserError where it never is.
+    ``shown`` prints the command; ``environment`` holds more variables, ``options`` more of Popen.
     """
 
     def __init__(
@@ -120,7 +119,6 @@ class Process:
             return -signal.SIGKILL
 
     def wait(self, timeout_s: float = 2 * PATIENCE_S) -> int:
-        """Wait until it ends; return its exit status. CommandTimeoutError."""
         self._ended_by_us = True
         try:
             status = self._process.wait(timeout_s)

@@ -1,15 +1,13 @@
 """Environments by name: the two scenarios, and any other environment adapted to look like them.
 
-The trainer sees every environment in one form: an observation is one array (a structured one for
-several entries), an action is float32 [n] in [-1, 1], and a step's ``info`` holds position, speed
-and, in the last step, the outcome. `Adapted` brings any environment into that form; `outer` and
-`inner` are the only places where actions are scaled.
+An observation is one array (a structured one for several entries), an action is float32 [n] in
+[-1, 1]; `outer` and `inner` alone scale it. A step's ``info`` holds position, speed and, in the
+last step, the outcome.
 """
 
 import copy
 import math
 from collections.abc import Callable, Mapping
-from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +21,7 @@ from bridge.inbound import ROUNDING_S
 from bridge.network import COMMAND_WINDOW, LatencySpec, VirtualLink
 from bridge.outcomes import outcome_of
 from edge_runtime.manifest import Task
-from edge_runtime.util import UserError
+from edge_runtime.util import UserError, load_named
 from edge_runtime.wire import DRIVE, Command
 from trainer.human.guide import Action, Expert, Reason
 from trainer.learner.replay import Observation, ReplayLayout
@@ -65,14 +63,12 @@ def make_environment(
     period_s: float | None = None,
     success: str = "",
 ) -> Any:
-    """Make the environment of a scenario's word, a gymnasium id or ``module:id``.
+    """Make the environment of a scenario's word, a gymnasium id or ``module:id``; UserError.
 
-    The two scenarios come as they are, in the scene of a test condition; any other environment is
-    `Adapted`. With ``printed_reward`` a scenario pays what eq. 31 or 32 says, without its own
-    weight. A step lasts ``period_s`` where given, else what the environment says, else 0.1 s, which
-    a line says. ``success`` is ``module:function`` that judges the episodes of one that does not.
-
-    Raises UserError for no such environment, or one that cannot be driven here.
+    The two scenarios come as they are, in the scene of a test condition; any other is `Adapted`.
+    With ``printed_reward`` a scenario pays what eq. 31 or 32 says, without its own weight. A step
+    lasts ``period_s``, else what the environment says, else 0.1 s, which a line says. ``success``
+    is a ``module:function`` that judges the episodes of one that does not.
     """
     name, scene = scenario_of(name), CONDITIONS[condition].scene
     if name not in SCENARIOS:
@@ -140,12 +136,7 @@ def check_foresight(env: Any) -> None:
 
 
 def expert_of(env: Any, human: str = "expert") -> Expert:
-    """Return the environment's scripted expert, with a memory of its own.
-
-    ``human`` may be ``module:Class`` of another expert, which is made from the environment.
-
-    Raises UserError where there is none.
-    """
+    """Return the environment's scripted expert, or another, ``module:Class``; UserError: none."""
     if ":" not in human:
         if env.expert is None:
             raise UserError(f"{env.scenario} offers no expert(); name one as module:Class")
@@ -155,14 +146,6 @@ def expert_of(env: Any, human: str = "expert") -> Expert:
         return _ScaledExpert(env, made(env.unwrapped))
     except Exception as error:  # It may raise anything
         raise UserError(f"no expert {human!r}: {type(error).__name__}: {error}") from error
-
-
-def load_named(place: str, what: str) -> Any:
-    """Import ``module:name``; UserError where that fails."""
-    try:
-        return EntryPoint(place, place, "").load()
-    except Exception as error:  # A module may raise anything when it is imported
-        raise UserError(f"no {what} {place!r}: {type(error).__name__}: {error}") from error
 
 
 def outer(action_range: tuple[Any, Any], action: Any) -> NDArray[np.float32]:
@@ -181,8 +164,7 @@ def inner(action_range: tuple[Any, Any], action: Any) -> Action:
 class Adapted(bridge.Adapter):
     """Any environment in the form of the two scenarios.
 
-    It has Box or flat Dict observations, and a Box of actions with finite bounds. ``name`` is the
-    name by which it was made; ``judge`` says at an episode's end whether it succeeded. Raises
+    It was made by the ``name``; ``judge`` says at an episode's end whether it succeeded. Raises
     UserError for what `bridge.environments.describe` refuses.
     """
 

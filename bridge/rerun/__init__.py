@@ -77,7 +77,7 @@ def has_display() -> bool:
 def check_sink(sink: str | None, port: int | None = None) -> str:
     """Return the sink: spawn (also for None), serve, or an absolute path that ends in .rrd.
 
-    Raise UserError for any other, and where nothing can be shown there. ``port``: of the page.
+    UserError for any other, and where nothing can be shown there, as at a ``port`` of a page.
     """
     sink = sink or SPAWN
     if port is not None:
@@ -112,7 +112,6 @@ def open_sink(
 
 
 def flush(recording: rr.RecordingStream) -> None:
-    """Wait until all that was drawn has arrived; ViewerGone where it does not."""
     try:
         recording.flush(timeout_sec=FLUSH_S)
     except RuntimeError as error:

@@ -1,8 +1,7 @@
 """The adapter from a drive to rerun, and ``python -m bridge view``, which shows the wire by it.
 
-A `Canvas` draws lines, states, pictures and the road from above; the functions after it lay views
-out, also those of test drives (``trainer.view``). Metres; y grows downwards, as in the scene. Cars
-are lines: rerun cannot turn its flat boxes.
+A `Canvas` draws; the functions after it lay views out, also those of ``trainer.view``. Metres; y
+grows downwards, as in the scene. Cars are lines: rerun cannot turn its flat boxes.
 """
 
 from __future__ import annotations
@@ -70,7 +69,6 @@ class Canvas:
         self.log(path, rr.Scalars(values))
 
     def style(self, path: str, colour: Colour, names: Sequence[str]) -> None:
-        """Name the lines at one path, and give them shades of a colour."""
         colours, widths = shown.shades(colour, len(names)), [2.0] * len(names)
         self.log(path, rr.SeriesLines(colors=colours, names=names, widths=widths), static=True)
 
@@ -80,7 +78,6 @@ class Canvas:
             self.log(path, rr.StateChange(state=value))
 
     def status(self, *lines: str) -> None:
-        """Replace the text that says how things stand; empty lines are left out."""
         text = "\n\n".join(filter(None, lines))
         self.log("status", rr.TextDocument(text, media_type="text/markdown"))
 
@@ -161,7 +158,6 @@ def road_view(scene: SeenScene | None) -> rrb.Spatial2DView:
 
 
 def sees_view(frames: bool = True) -> rrb.Horizontal:
-    """Show what the policy sees (two frames, or lines), and the status."""
     seen: list[Any] = [plot_view("observation", "Policy sees")]
     if frames:
         view = rrb.Spatial2DView
@@ -230,7 +226,6 @@ class WireLog:
         self._shadow: Command | None = None  # The newest answer of a policy in the shadow
 
     def write(self, heard: Heard) -> None:
-        """Draw one message as it came; a token shows as silence."""
         if heard.topic not in DECODERS:
             return
         message = messages.decode(heard)

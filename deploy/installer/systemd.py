@@ -1,8 +1,7 @@
 """Run a release as a systemd service, and try it before.
 
-A trial is the release's own runtime with its own policy, settings, certificates and user, but
-without a vehicle, towards a port where nobody listens, in a network of its own. Whatever is wrong
-with it, the vehicle gets no command from it.
+A trial is the release's own runtime, policy, settings, certificates and user, without a vehicle,
+in a network of its own.
 """
 
 from __future__ import annotations

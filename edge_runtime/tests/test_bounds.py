@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 from hil_tests.tests.shared.policies import T
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge_runtime.bounds import NO_BOUNDS, Bounds, Leash, Model, narrowed
@@ -90,6 +90,7 @@ def test_the_loops_range_of_steering_is_never_above_the_cap(spec, scenario, shar
 
 
 @pytest.mark.parametrize("make", [HunterRig, Ros2Rig])
+@settings(max_examples=40)
 @given(st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=8))
 def test_no_wheel_is_turned_further_than_its_cap(make, wishes):
     rig, cap_rad = make("congestion"), 0.05

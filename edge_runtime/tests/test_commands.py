@@ -117,7 +117,8 @@ WRONG = {
     "connect = 'tcp/host:70000'": "70000",
     "vehicle_id = 'a/b'": "a/b",
     "bus = 'can0'": "bus",
-    "[vehicle]\nname = 'mock'": "vehicle_settings",
+    "[vehicle]\nname = 'mock'": "vehicle.name",
+    "[vehicle]\ndriver = 'mock'\nmax_sped_mps = 0.3": "vehicle.max_sped_mps",
     "[vehicle]\ndriver = 3": "vehicle",
     "[vehicle]\nrearm = 'never'": "vehicle.rearm.*each_episode, once",
     **{

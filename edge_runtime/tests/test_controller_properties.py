@@ -271,6 +271,6 @@ class AnyHistory(RuleBasedStateMachine):
     [(False, True, True), (True, True, False), (True, True, True), (True, False, True)],
 )
 def test_any_history(vehicle, armed_at_start, each_episode, ride_s):
-    patient = settings(max_examples=30, stateful_step_count=30)
+    patient = settings(max_examples=24, stateful_step_count=30)
     make: Any = partial(AnyHistory, vehicle, armed_at_start, ride_s, each_episode)
     run_state_machine_as_test(make, settings=patient)

@@ -333,7 +333,7 @@ kinds_of_life = st.fixed_dictionaries({
 })  # fmt: skip
 
 
-@settings(max_examples=1000)
+@settings(max_examples=500)
 @given(st.booleans(), st.sampled_from([0.0, 0.5]), delays, st.lists(kinds_of_life, max_size=6))
 def test_no_story_drives_on_a_late_state_or_without_a_permission(vehicle, ride_s, down_s, story):
     world = World(vehicle, ride_s, down_s)

@@ -18,7 +18,7 @@ from edge_runtime.controller import ActionLimit
 from edge_runtime.reach import free_endpoint
 from edge_runtime.tests.rigs import CAR, BrokenVehicle, a_manifest
 from edge_runtime.util import UserError
-from edge_runtime.vehicles import find_vehicle, installed_as, make_vehicle, vehicle_limits
+from edge_runtime.vehicles import find_vehicle, make_vehicle, vehicle_limits
 from edge_runtime.vehicles.mock import MockVehicle
 
 MODULE = """
@@ -87,7 +87,6 @@ WHOLE = msgspec.structs.asdict(CAR)
         ("ros2", {"connect": "tls/h:1"}, "plain text"),
         ("ros2", {"listen": "tcp/h:1", "connect": "tcp/h:1"}, "listen and connect"),
         ("ros2", {"odometry_topic": ""}, "''"),
-        ("ros2", {"odometry_topic": "/cmd_vel"}, "one topic for both"),
         ("ros2", {"twist_angular": "degrees"}, "yaw_rate, steering"),
     ],
 )
@@ -120,8 +119,6 @@ def test_a_driver_of_another_package_gets_its_own_table_and_its_limits_open_noth
     for name, wheels in (("milk_cart", 3), ("carts:Cart", 2)):
         vehicle: Any = make_vehicle(name, tables, a_manifest())
         assert (vehicle.name, vehicle.wheels) == ("cart", wheels)
-    # A recording has the name that it calls itself by.
-    assert (installed_as("cart"), installed_as("mock")) == ("milk_cart", "mock")
     assert vehicle_limits("none", tables, a_manifest()) == {}
     shut = {"milk_cart": {"port": "ttyS9"}, "hunter": {"bus": "socketcan:nowhere"}}
     assert vehicle_limits("milk_cart", shut, a_manifest()) == MockVehicle.limits

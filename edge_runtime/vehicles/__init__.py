@@ -94,15 +94,6 @@ def find_vehicle(name: str) -> Type[Vehicle]:
     return kind
 
 
-def installed_as(own_name: str) -> str:
-    """Return the installed name of the driver that calls itself `own_name`, if there is one."""
-    for point in _others():
-        with contextlib.suppress(UserError):
-            if find_vehicle(point.value).name == own_name:
-                return str(point.name)
-    return own_name
-
-
 def _find(name: str, tables: Tables) -> Tuple[Type[Vehicle], Mapping[str, Any]]:
     """Return the class, and its table: by its name here, or a module:Class by its own name.
 
@@ -117,7 +108,6 @@ def _find(name: str, tables: Tables) -> Tuple[Type[Vehicle], Mapping[str, Any]]:
 
 
 def _others() -> Iterable[Any]:
-    """Return the entry points of other packages."""
     found: Any = entry_points()
     # Before Python 3.10 a dict of lists; two folders on the path may both name one.
     return found.select(group=GROUP) if hasattr(found, "select") else found.get(GROUP, ())

@@ -1,8 +1,7 @@
 """The contract of a vehicle driver, and the thread that runs one.
 
-One thread at a time calls a driver, and passes it the time in monotonic seconds. That thread is
-apart from the control loop: feedback goes on when the loop hangs, and shows the vehicle braking by
-itself; and the loop goes on, and says safe stop, when the driver raises or hangs.
+One thread at a time calls a driver, and passes it the time in monotonic seconds. It is apart from
+the control loop: each of the two goes on, and stops the vehicle, when the other hangs.
 """
 
 from __future__ import annotations
@@ -25,9 +24,8 @@ from edge_runtime.wire import FEEDBACK_HZ, MAX_TEXT_CHARS, SAFE_STOP, Command, F
 class Vehicle(abc.ABC):
     """A vehicle under command. `limits` is keyed by the action names of the manifest, in its units.
 
-    `name` is what others see, and the table in the settings; by default the class's own name.
-    The runtime sets `control_period_s` to the policy's before `enable`; until then it is the
-    shortest that a policy may have, which brakes soonest. A driver drives no faster than
+    `name` is what others see, and the table in the settings; by default the class's own name. The
+    runtime sets `control_period_s` to the policy's before `enable`. A driver drives no faster than
     `allowed.max_speed_mps`; the runtime stops one that does, and sees to the other bounds.
 
     For `jog`: `outranked_by` has what its reports' `standing` says of a "remote_control" and an

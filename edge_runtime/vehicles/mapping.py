@@ -125,10 +125,9 @@ def similarity_to(car: Car, spec: HunterSpec, scale: Optional[float] = None) -> 
 
 
 class RobotSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of every vehicle that takes a speed and an angle.
+    """Settings of every vehicle that takes a speed and an angle; `car`: in the manifest's place.
 
-    `scale`: metres of the vehicle for one of the scenario; None: top speed is top speed. `car`: in
-    place of the manifest's.
+    `scale`: metres of the vehicle for one of the scenario; None: top speed is top speed.
     """
 
     model: str = "2.0"

@@ -1,7 +1,6 @@
 """A vehicle of arithmetic: dead time, rate limit and first-order lag before the wheels obey.
 
-It integrates its own motion up to the time it is asked about, so that it needs no thread, and a
-test with made-up times sees exactly what a process sees.
+It integrates its motion up to the time it is asked about, and needs no thread.
 """
 
 from __future__ import annotations

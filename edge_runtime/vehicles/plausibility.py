@@ -1,8 +1,7 @@
 """Whether a vehicle can be believed. Pure: every call is passed the time, in monotonic seconds.
 
-Two watch over a vehicle with the same words (`Fault`). `VehicleWatch` sees the commands and reports
-of any driver. `DriveWatch` sees set-point and feedback of a streamed vehicle, in m/s and rad; so it
-finds a steering that does not follow, and a speed whose pedal nobody asked for.
+`VehicleWatch` sees the commands and reports of any driver. `DriveWatch` sees set-point and feedback
+of a streamed vehicle, in m/s and rad; so it finds a steering that does not follow.
 """
 
 from __future__ import annotations
@@ -40,9 +39,8 @@ class VehicleReport(NamedTuple):
     """What the vehicle does. `action` is what its actuators have reached, in the units of `limits`.
 
     `faults` say in words why it does not drive, until it is enabled again; `standing` are those
-    whose cause is there now, so that enabling would be in vain. A vehicle that takes a speed
-    instead of a pedal works its pedal out from its speed, and reports two speeds more: its own in
-    the scenario, and the one that it is asked for (m/s of its own).
+    whose cause is there now. A vehicle that takes a speed instead of a pedal reports two speeds
+    more: its own in the scenario, and the one that it is asked for (m/s of its own).
     """
 
     action: Dict[str, float]

@@ -1,11 +1,10 @@
 """The driver of a vehicle that must hear from it 50 times a second: what decides, and what sends.
 
-`StreamedCore` decides: a state machine (LEADS_TO), what was heard of the vehicle, and what is asked
-of it. It is pure: its holder (`StreamedVehicle`, a test) serialises the calls, passes monotonic
-seconds, and sends what `tick` returns. `StreamedVehicle` is the shell: a lock and a thread.
+`StreamedCore` decides, by a state machine (LEADS_TO). It is pure: its holder serialises the calls,
+passes monotonic seconds, and sends what `tick` returns. `StreamedVehicle` is the shell.
 
-STOPPED is a latch of our own: a chassis takes commands again by itself when they resume after its
-time-out, when the remote control lets go, or when an error passes. Only ENABLE leads out.
+STOPPED is a latch of our own, and only ENABLE leads out: a chassis takes commands again by itself,
+when they resume, when the remote control lets go, or when an error passes.
 """
 
 from __future__ import annotations

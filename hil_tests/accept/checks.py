@@ -264,7 +264,7 @@ def in_real_time(job: Job) -> Found:
 
 def replay(path: str | Path, job: Job) -> Found:
     assert job.policy is not None
-    report, _ = report_replay(RecordedDrive(Path(path), None), job.policy, job.config)
+    report = report_replay(RecordedDrive(Path(path), None), job.policy, job.config)
     others = [each[:12] for each in report["recorded_policy_ids"] if each != job.policy_id]
     wrong = [f"policy {', '.join(others)} made it"] if others else []
     wrong += [f"{report['different']} answers differ"] if report["different"] else []

@@ -67,9 +67,7 @@ def leash(rig: Rig) -> Try:
 
 
 def new_episode(rig: Rig) -> Try:
-    """Judge that none starts it: with a final state before it or without, with a number of its own
-    or, behind a final state, the last one's.
-    """
+    """Judge that no new episode starts it, behind a final state or not, of a new number or not."""
     sender, kind = rig.sender, rig.number % 3
     rig.wait_until_driving(lambda: rig.chassis.moves)  # else it may stand now, and move a moment on
     sender.running.clear()

@@ -1,9 +1,8 @@
 """Faults of a Hunter on a CAN bus: the edge runtime's driver against the mock as a process.
 
 The rule, for each row: within 2 T + 50 ms after the edge can know, the set-point on the bus is
-speed 0 and stays so; the vehicle stands (by the mock's own truth, whatever it reports), though
-the mock would drive on by itself when the fault is over; feedback names the fault in words; only a
-re-arm lets it move. When the edge can know:
+speed 0 and stays so; the vehicle stands by the mock's own truth; feedback names the fault; only a
+re-arm lets it move, though the mock drives on by itself. When the edge can know:
 - silent, bus off, late: at the last frame that came in time, for the next ones were due;
 - frozen: the same, and STATUS_SILENCE_S later, for it goes on sending;
 - the others: at the first frame on the bus that shows it (full lock: and DEVIATES_S later);
@@ -42,10 +41,7 @@ _REFUSED = ("silent", "frozen", "bus_off", "remote", "estop")
 
 
 class Expect(NamedTuple):
-    """A fault of the mock: its words in the feedback, and the first frame that shows it.
-
-    ``can_id`` and ``shows`` tell that frame; 0 where none does.
-    """
+    """A fault of the mock, its words in the feedback, and what frame shows it (0: none does)."""
 
     name: str
     says: str
@@ -54,7 +50,6 @@ class Expect(NamedTuple):
 
 
 def speed_mps(data: bytes) -> float:
-    """Decode the speed of SET_POINT or SPEED by hand."""
     return int.from_bytes(data[:2], "big", signed=True) * 1e-3
 
 

@@ -1,12 +1,10 @@
 """What runs inside the disturbed processes: a drive without an end, and commands with faults.
 
-``python -m hil_tests.faults.inside PACKAGE ARGUMENTS`` is the real command, with the faults that
-cannot be done to it from outside.
-
-The directory PHIL_FAULT_DIR holds the switches, which are files: END ends the episode, BRIGHT turns
-pictures white, SLOW slows inference down, VEHICLE holds the fault of the mock vehicle, SOURCE that
-of a source of `sense`. The TASK of the policy stands there, too, and the log of the simulated
-brake: a line in BRAKES for each change, with its monotonic time and 1 where it is pressed.
+``python -m hil_tests.faults.inside PACKAGE ARGUMENTS`` is the real command, with faults that cannot
+be done to it from outside. The directory PHIL_FAULT_DIR holds TASK, and switches, which are files:
+END ends the episode, BRIGHT turns pictures white, SLOW slows inference down, VEHICLE and SOURCE
+hold the fault of the mock vehicle and of a source of `sense`. BRAKES is the log of the simulated
+brake: a line for each change, with its monotonic time and 1 where it is pressed.
 """
 
 from __future__ import annotations
@@ -141,8 +139,6 @@ class FaultyMockVehicle(MockVehicle):
 
 
 class FaultySource:
-    """A robot's senses: noise, with the fault that SOURCE holds."""
-
     speed_mps = 0.5
 
     def __init__(self) -> None:
@@ -164,8 +160,7 @@ class FaultySource:
 def launch(package: str, *arguments: str) -> None:
     """Run a package's command.
 
-    SIGUSR1 steps its wall clock one hour ahead, SIGUSR2 back again. While the switch SLOW is there,
-    an inference takes SLOWER_S more.
+    SIGUSR1 steps its wall clock one hour ahead, SIGUSR2 back. SLOW adds SLOWER_S to an inference.
     """
     real, real_ns, act, step_s = time.time, time.time_ns, Policy.act, [0]
     time.time = lambda: real() + step_s[0]

@@ -45,7 +45,6 @@ def bad_states(rig: Rig) -> Try:
 
 
 def _bad_of(step: int, task: Task) -> Iterable[tuple[str, bytes]]:
-    """Yield (reason, payload) of states that must be rejected, around the newest step."""
     state, (name, *_) = noisy_state(step + 1, task), task.observation
     large, small = ({**state.observation, name: bytes(n)} for n in (wire.MAX_PAYLOAD_BYTES, 3))
     valid = encode(state)
@@ -119,7 +118,6 @@ def garbage_commands(rig: Rig) -> Try:
 
 
 def _command(rig: Rig, ahead: int = 0, **changes: object) -> Command:
-    """Make a drive command to the newest state, or to one ``ahead`` of it."""
     session, episode, step = rig.timeline.commands[-1].place
     middle = [0.45 * one.low + 0.55 * one.high for one in rig.task.action]
     fields: dict[str, Any] = {
@@ -183,7 +181,6 @@ def mutated(valid: bytes, count: int, seed: int) -> Iterator[bytes]:
 
 
 def with_fields(valid: bytes, **changes: object) -> bytes:
-    """Replace fields of a MessagePack map by values of any type."""
     return msgspec.msgpack.encode({**msgspec.msgpack.decode(valid), **changes})
 
 

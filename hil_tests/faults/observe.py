@@ -1,7 +1,6 @@
 """What stands between the two ends of a drive, and what is seen there: Zenoh, TCP and CAN.
 
-Times are monotonic seconds: that clock is one for all processes of a machine, so the times of the
-probe, of the edge runtime's log and of the simulated vehicle can be taken from one another.
+Times are monotonic seconds, which are one clock for all processes of a machine.
 """
 
 from __future__ import annotations
@@ -83,8 +82,8 @@ class DriveTimeline:
     def unsafe_commands(self, task: Task = TASK) -> list[str]:
         """Return what is wrong with each unsafe command.
 
-        A ``drive`` is unsafe outside the task's ranges, in answer to a state that nobody sent or
-        that was to be rejected, and later than the reaction limit after the state that it answers.
+        A ``drive`` is unsafe outside the task's ranges, in answer to no acceptable state, and later
+        than the reaction limit after its state.
         """
         limit_s = REACTION_LIMIT_S + later_s(task)
         found = [f"{self.unreadable} commands that nobody would take"] * bool(self.unreadable)
@@ -110,16 +109,14 @@ def later_s(task: Task) -> float:
 
 
 def longest_gap_s(times_s: Iterable[float], begin_s: float, end_s: float) -> float:
-    """Return the longest stretch within [begin, end] without an event, s."""
     inside = [begin_s, *sorted(t for t in times_s if begin_s < t < end_s), end_s]
     return max(after - before for before, after in pairwise(inside))
 
 
 class Probe:
-    """A Zenoh router between the two ends that stamps what passes; ``put`` sends any bytes.
+    """A Zenoh router between the two ends that stamps what passes, until the ``stack`` ends.
 
-    It listens for the edge runtime and connects to the simulator, so that it hears each while the
-    other is gone. It ends with the ``stack``.
+    It listens for the edge runtime and connects to the simulator, so that it hears each alone, too.
     """
 
     def __init__(
@@ -235,8 +232,6 @@ def _shut(end: socket.socket) -> None:
 
 
 class CanMonitor(can.Listener):
-    """Listens to a CAN bus in a thread, and keeps the frames of HEARD."""
-
     def __init__(self, bus: str) -> None:
         self.heard: list[tuple[float, int, bytes]] = []  # Monotonic time, identifier, data
         self.strange: list[int] = []  # Identifiers that nobody should send: not the Hunter's
@@ -244,7 +239,6 @@ class CanMonitor(can.Listener):
         self._notifier = can.Notifier(self._bus, [self], timeout=0.1)
 
     def of(self, can_id: int, since_s: float = -math.inf) -> list[tuple[float, bytes]]:
-        """Return times and data of the frames of an identifier since a moment, in order."""
         return [(s, data) for s, heard_id, data in self.heard if heard_id == can_id and s > since_s]
 
     def close(self) -> None:

@@ -31,7 +31,6 @@ faults (uint8[batch, 2, 45, 80] frames) => (float[batch, 1] action)
 
 
 def write_policy(folder: Path, kind: str) -> Path:
-    """Write the unsigned policy of that name."""
     path, model = folder / f"{kind}.onnx", onnx.parser.parse_model(_GRAPH.format(*POLICIES[kind]))
     path.write_bytes(make_policy(model.SerializeToString(), TASK, "faults", {}))
     return path

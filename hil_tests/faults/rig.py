@@ -32,7 +32,6 @@ from hil_tests.faults.observe import CanMonitor, CommandSeen, DriveTimeline, Pro
 from hil_tests.processes import Process, wait_until
 
 VEHICLE_ID = "faults"
-RIDE_S = 0.5  # Of the rows with ride-through
 _INSIDE = "hil_tests.faults.inside"
 _STOPPED = re.compile(r"\bmode\b.*\bnow\W+safe_stop\b(?:.*\breason\W+(\w+))?")
 _TOLD = re.compile(r"chassis t=([\d.]+) .*motion=(\w+)")
@@ -44,12 +43,11 @@ _HEALTH_S = 0.6  # Longer than a period of the health message
 class Rig:
     """Start it with ``with``; it ends every process that it started.
 
-    ``policy`` are the edge runtime's options for its policy, which is made for ``task``;
-    ``vehicle`` is its ``--vehicle``. The ``directory`` is an empty one, for switches and reports.
-    Edge runtime and probe meet at a ``relay`` or a ``router`` where ``between`` says so. ``sender``
-    sends states here, without a simulator; with ``senses`` a source stands in its place.
-    ``settings`` is TOML for the edge runtime. With the vehicle ``hunter`` there is a mock of it on
-    a CAN bus. The attributes below exist only where the options ask for them.
+    ``policy`` are the edge runtime's options for its policy, made for ``task``; ``vehicle`` is its
+    ``--vehicle`` (``hunter``: with a mock on a CAN bus), ``settings`` its TOML. Switches and
+    reports lie in the empty ``directory``. Edge runtime and probe meet at a ``relay`` or
+    ``router``, if it is ``between``. ``sender``: states are sent here, without a simulator;
+    ``senses``: by a source. The attributes below exist only where the options ask for them.
     """
 
     simulator: Process
@@ -67,7 +65,6 @@ class Rig:
         between: str = "",
         vehicle: str = "none",
         sender: bool = False,
-        ride_s: float = 0.0,
         senses: bool = False,
         settings: str = "",
     ) -> None:
@@ -79,8 +76,7 @@ class Rig:
         self._directory, self._processes = directory, list[Process]()
         self._policy, self._senses = policy, senses
         self._edge = [*policy, "--vehicle-id", VEHICLE_ID, "--vehicle", vehicle]
-        told = f"[ride_through]\nmax_s = {ride_s}\n{settings}"
-        (directory / "edge.toml").write_text(told)
+        (directory / "edge.toml").write_text(settings)
         self._edge += ["--config", str(directory / "edge.toml")]
         (directory / inside.BRAKES).touch()
         (directory / inside.TASK).write_bytes(msgspec.json.encode(task))
@@ -133,7 +129,6 @@ class Rig:
         )  # fmt: skip
 
     def start_recorder(self) -> tuple[Process, Path]:
-        """Start `bridge record` of this drive into a new file, and wait until it listens."""
         path = self._directory / f"{time.monotonic_ns()}.mcap"  # a disturbed try is done again
         record = ("bridge", "record", "--out", str(path), "--connect", self._hub)
         return self._start(*record, "--vehicle-id", VEHICLE_ID, ready="recording"), path
@@ -148,7 +143,6 @@ class Rig:
         path.unlink(missing_ok=True) if word is None else path.write_text(word)
 
     def try_rearm(self) -> bool:
-        """Ask once for a re-arm; return whether the runtime accepted it."""
         with contextlib.suppress(UserError):  # on a starved machine an answer may take too long
             return bool(ask(self._hub, VEHICLE_ID, "rearm")["accepted"])
         return False
@@ -213,7 +207,6 @@ class Rig:
         return found
 
     def last_drive_s(self) -> float:
-        """Return when the newest drive command came; -inf before the first."""
         times = (c.seen_s for c in reversed(self.timeline.commands) if c.mode == DRIVE)
         return next(times, float("-inf"))
 
@@ -331,7 +324,6 @@ class Chassis(Process):
         return max(self.truth[-1][0], since_s)
 
     def moved_between(self, begin_s: float, end_s: float) -> bool:
-        """Return whether it moved at any moment in between."""
         before = [moves for since_s, moves in self.truth if since_s <= begin_s][-1:]
         return any(before + [moves for since_s, moves in self.truth if begin_s < since_s < end_s])
 

@@ -1,12 +1,10 @@
 """Faults of both ends, of the link between them, of the mock vehicle and of a recorder.
 
-A function here takes a driving rig, does a fault once, undoes it, and returns a `Try`. A `Row` in
-ROWS says what it does, in words, and what is expected. Faults of messages and of a Hunter have
-files of their own; `run.py` joins the three tables.
+A function takes a driving rig, does a fault once, undoes it, and returns a `Try`. A `Row` in ROWS
+says what it does, in words, and what is expected. `run.py` joins the tables.
 
-The last rows are of a drive with ride-through of RIDE_S. While no state or no command comes, the
-last command's plan is played: through what is shorter, nothing brakes. What is longer brakes,
-RIDE_S later than without it. A fault of the vehicle and a stop end it at once.
+The last rows are of a drive with ride-through of RIDE_S: through what is shorter, nothing brakes;
+what is longer brakes RIDE_S later. A fault of the vehicle and a stop end it at once.
 """
 
 from __future__ import annotations
@@ -28,7 +26,7 @@ from bridge.recording import Recording, heard_of
 from edge_runtime.wire import DRIVE, SAFE_STOP, State, decode_state, encode
 from hil_tests.faults.inside import MOCK, SLOW, SOURCE, VEHICLE
 from hil_tests.faults.observe import REACTION_LIMIT_S, RECOVERY_LIMIT_S
-from hil_tests.faults.rig import RIDE_S, VEHICLE_ID, Rig, noisy_state
+from hil_tests.faults.rig import VEHICLE_ID, Rig, noisy_state
 from hil_tests.processes import wait_until
 from trainer.util import cores
 
@@ -37,10 +35,10 @@ from trainer.util import cores
 class Try:
     """One fault, done and undone.
 
-    ``reaction_s``: from the last good state or feedback to the safe stop on the wire (in the log
-    where the wire is cut), or from the last drive command to the simulator's own brake; where the
-    drive goes on the longest gap between commands; None where nothing was to react.
-    ``recovery_s``: from the fault's end to the first drive command; None where none is due.
+    ``reaction_s``: from the last good state or feedback to the safe stop on the wire (if that is
+    cut, in the log), or from the last drive command to the simulator's own brake; where the drive
+    goes on the longest gap between commands. ``recovery_s``: from the fault's end to the first
+    drive command.
     """
 
     reaction_s: float | None = None
@@ -73,11 +71,7 @@ class Row:
 def drives_on(
     name: str, done: str, run: Callable[[Rig], Try], expected: str = "drives on", **options: Any
 ) -> Row:
-    """Make a row of a fault through which the drive goes on.
-
-    ``run`` returns what else is to be judged; ``rejected`` are the messages that it sent to be
-    rejected.
-    """
+    """Make a row of a fault through which the drive goes on; ``run`` tells what else is judged."""
     through = {"goes_on": True, "recovery_limit_s": None, "flows": True}
     return Row(name, done, expected, run, **{**through, **options})
 
@@ -300,8 +294,8 @@ def _too_few(states: list[State]) -> list[str]:
     return [f"only {len(states)} states can be read"] if len(states) < _FEWEST_STATES else []
 
 
-SHORT_S, RIDING_S = 0.4, 0.3
-"""An outage through which it rides, and where in one it surely rides."""
+RIDE_S, SHORT_S, RIDING_S = 0.5, 0.4, 0.3
+"""How long it rides at most; an outage through which it rides; where in one it surely rides."""
 
 
 def _link_slows(periods: float, rig: Rig) -> Try:
@@ -367,7 +361,8 @@ _STOP = "edge sends safe_stop: no_fresh_state"
 _REARM = "edge sends safe_stop: vehicle_fault; stays until re-armed"
 _RIDES = "rides: nobody brakes"
 _LATER_S = REACTION_LIMIT_S + RIDE_S
-_RELAY, _RIDING = {"between": "relay"}, {"ride_s": RIDE_S, "vehicle": MOCK}
+_RELAY, _RIDES_ON = {"between": "relay"}, {"settings": f"[ride_through]\nmax_s = {RIDE_S}"}
+_RIDING = {**_RIDES_ON, "vehicle": MOCK}
 _STEADY: Any = {"policy": "steady"}
 _MOCKED: Any = {**_STEADY, "rig": {"vehicle": MOCK}}
 _STUCK: Any = {**_MOCKED, "flows": True}
@@ -439,5 +434,5 @@ ROWS = [
         **{**_ENDED, "reaction_limit_s": REACTION_LIMIT_S}),
     Row("ride_edge_killed",
         "SIGKILL to the edge runtime, which the simulator rides out; a new one", _OWN,
-        edge_killed, reaction_limit_s=_LATER_S, rig={"ride_s": RIDE_S}),
+        edge_killed, reaction_limit_s=_LATER_S, rig=_RIDES_ON),
 ]  # fmt: skip

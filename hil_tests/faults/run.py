@@ -47,8 +47,7 @@ def run_faults(
 ) -> dict[str, Any]:
     """Do every row ``tries`` times, ``jobs`` rigs at once; return a report for JSON.
 
-    ``on_try`` is called with the row's name after every try. Rows that need the machine for
-    themselves run after the others. Raises UserError where the policy does not load.
+    ``on_try`` is called with the row's name after every try. UserError: the policy does not load.
     """
     given = load_policy(policy, public_key, allow_unsigned=True).manifest
     ended = threading.Event()  # No more tries are begun
@@ -144,8 +143,7 @@ def do_fault(row: Row, rig: Rig) -> Try:
 def report_row(row: Row, outcome: Outcome, later_s: float = 0.0) -> dict[str, Any]:
     """Return a row of the report: spreads of the times, how many were late, and what was wrong.
 
-    For another T than 0.1 s a reaction may take ``later_s`` longer, which is the difference of 2 T,
-    and a recovery that of the five states that it takes.
+    ``later_s``: how much longer 2 T is than 0.2 s; a recovery takes five states.
     """
     report: dict[str, Any] = {"name": row.name, "done": row.done, "expected": row.expected}
     report |= {"tries": len(outcome.tries), "disturbed": outcome.disturbed}

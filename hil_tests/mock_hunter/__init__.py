@@ -1,12 +1,9 @@
 """``python -m hil_tests mock_hunter``: a Hunter of arithmetic on a CAN bus, with its faults.
 
-`MockHunter` has no clock: frames and time in, frames out. `serve` runs it on a bus.
-
-The rules of the chassis come first: CONTROL says who drives, BITS which errors stop it, FAULTS what
-can be switched on. The manual leaves open what follows when the remote control or the emergency
-stop lets go: here the chassis goes back to where it was, which gives control back by itself. That
-is the worst case for whoever commands it, as its answer to frames that come back after a time-out
-is (and that one is documented).
+`MockHunter` has no clock: frames and time in, frames out. `serve` runs it on a bus. CONTROL says
+who drives, BITS which errors stop it, FAULTS what can be switched on. The manual leaves open what
+follows when remote control or emergency stop lets go: here control goes back to where it was, which
+is the worst case.
 """
 
 from __future__ import annotations
@@ -36,8 +33,7 @@ from edge_runtime.vehicles.mapping import clamp
 class Bit(NamedTuple):
     """An error that the chassis shows in 0x211, by the driver's words for it.
 
-    ``stops``: it then lets nobody drive. ``latches``: it stays until 0x441 clears it. Which do
-    so the manual leaves open: assumed.
+    It ``stops`` whoever drives; it ``latches`` until 0x441. Which do so is assumed.
     """
 
     words: str
@@ -345,7 +341,6 @@ def serve(hunter: MockHunter, bus: can.BusABC, orders: Orders, ending: threading
 
 
 def _read_orders(orders: Orders) -> None:
-    """Read `NAME on` or `NAME off`, line by line, from standard input."""
     with open(0, errors="replace", closefd=False) as lines:
         for line in lines:
             name, _, word = line.strip().partition(" ")

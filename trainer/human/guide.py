@@ -96,8 +96,8 @@ class Guide:
 class Asking:
     """Lets the robot ask for help where its critics differ most; the human need not watch.
 
-    It asks where the doubt is among the ``share`` of the highest of late: a budget of help, as in
-    ThriftyDAgger (2109.08273). Until it knows which doubts are high, the human watches.
+    It asks where the doubt is among the ``share`` of the highest of late, as ThriftyDAgger does
+    (2109.08273). Until it knows which doubts are high, the human watches.
     """
 
     MEMORY = 500  # Control periods

@@ -106,12 +106,12 @@ def _stretch_in_strip(shape: Rectangle, low_y: float, high_y: float) -> tuple[fl
 class LeftTurnHuman(Expert):
     """Waits at the stop line, picks a gap, and then commits; and judges the policy's action.
 
-    A driver who changes their mind with the nose in the lane is hit. A driver who needs a wide gap
-    to start and a narrow one to go on is not, and is easier to imitate.
+    Whoever changes their mind with the nose in the lane is hit. To need a wide gap to start and a
+    narrow one to go on is safe, and easier to imitate.
 
-    As a judge it accepts an action that leaves a way out and does not stop in the lane. A judge
-    that only followed the present pedal would object to each brisk approach to the stop line, the
-    expert's own included; but theorem 1 holds only where no optimal policy is taken over from.
+    As a judge it accepts what leaves a way out and does not stop in the lane. To follow the present
+    pedal alone would be to object to each brisk approach, the expert's own included; but theorem 1
+    holds only where no optimal policy is taken over from.
     """
 
     HORIZON_S = 6.0

@@ -1,9 +1,8 @@
 """A sitting's recording: every step, kept from the moment it is taken.
 
-One MCAP file a sitting, ``sitting-0001.mcap`` and so on; its messages are whole transitions
-(``RecordedStep``) in MessagePack. Each step is a chunk of its own, handed to the operating system
-at once, so a kill loses at most one step: the one that was being taken, or an episode's last, which
-says whether the person discarded it. 30 minutes are about 14 MB. Nothing is ever overwritten.
+One MCAP file a sitting, whose messages are whole transitions (``RecordedStep``) in MessagePack,
+each in a chunk of its own, handed to the operating system at once: a kill loses one step at most.
+30 minutes are about 14 MB. Nothing is ever overwritten.
 """
 
 import io

@@ -1,12 +1,10 @@
 """AgileX Hunter 2.0 and SE: what decides, the CAN bus, and the driver between them.
 
-`HunterCore` is pure: it hears every frame of the bus, and its `tick` gives the frames to send;
-`Reports` holds what was heard of the chassis. `HunterVehicle` puts two threads around it: the
-stream's sends what `tick` gives, and is the only one that sends until `close` has joined it; the
-listener's hands every frame to `hear`.
+`HunterCore` is pure: it hears every frame of the bus, and its `tick` gives the frames to send.
+`HunterVehicle` puts two threads around it: the stream's is the only one that sends until `close`
+has joined it; the listener's hands every frame to `hear`.
 
-python-can is imported here and nowhere else in the runtime, and only when a bus is opened: a board
-without a CAN vehicle need not have it.
+Nothing else in the runtime imports python-can, which a board without a CAN vehicle need not have.
 """
 
 from __future__ import annotations

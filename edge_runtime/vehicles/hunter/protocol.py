@@ -1,11 +1,10 @@
 """The Hunter's CAN frames (protocol V2) and fault bits: tables, one encoder, one decoder. Pure.
 
-CAN 2.0B with 11-bit identifiers, 500 kbit/s, big-endian, no checksum. Source: the maker's manual,
-as gathered in the hardware facts; a test holds its golden vectors. All frames go both ways here,
-because the mock of the chassis speaks the other side.
+CAN 2.0B with 11-bit identifiers, 500 kbit/s, big-endian, no checksum, by the maker's manual. All
+frames go both ways here: the mock of the chassis speaks the other side.
 
-Manuals of different firmware place the bits of 0x211 elsewhere, so that the profile is a setting.
-A bit that the profile does not know is a fault as well: then the profile is not this firmware's.
+Firmwares place the bits of 0x211 elsewhere, so that the profile is a setting. A bit that it does
+not know is a fault as well.
 """
 
 from __future__ import annotations

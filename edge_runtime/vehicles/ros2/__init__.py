@@ -1,13 +1,13 @@
 """A vehicle behind its own ROS 2 driver: standard messages on Zenoh. See README.md.
 
-First the messages without ROS 2; then what decides, pure: odometry in, motion out; then the session
-and two threads around it. The stream's thread publishes what `tick` gives: the ROS driver makes a
-frame of each message, and has no stream of its own. Zenoh's thread hands every odometry to `hear`.
+First the messages without ROS 2; then what decides, pure; then the session and two threads. The
+stream's publishes what `tick` gives, for the ROS driver has no stream of its own. Zenoh's hands
+every odometry to `hear`.
 
-A message is CDR behind a header of four bytes that says plain CDR (XCDR version 1), little-endian:
-`00 01 00 00`. Each field is aligned to its size, counted from behind the header. Types and order of
-fields are those of common_interfaces' .msg files (the same from Humble on); units as there: metres,
-seconds, radians, x forward, y to the left, positive steering and yaw to the left (REP 103).
+A message is little-endian CDR (XCDR version 1) behind a header of four bytes, `00 01 00 00`. Each
+field is aligned to its size, counted from behind the header. Types and order of fields are those of
+common_interfaces (the same from Humble on); units too: metres, seconds, radians, x forward, y,
+steering and yaw to the left (REP 103).
 """
 
 from __future__ import annotations
@@ -118,9 +118,9 @@ def topic_token(member: str, role: str, key: str, kind: str) -> str:
     """Return the token of a member's PUBLISHER or SUBSCRIBER, as zenoh-bridge-ros2dds has it.
 
     It makes every bridge (1.1 or later) create the reader or writer on its DDS side. Its last part
-    is `<keyed>:<reliable>:<transient local>:<history>,<depth>:<user data>` in DDS's numbers. We
-    publish reliably, because a reader of either kind matches, and subscribe best effort: a reliable
-    reader would never hear a best-effort writer, as sensors are.
+    is `<keyed>:<reliable>:<transient local>:<history>,<depth>:<user data>` in DDS's numbers. A
+    reader of either kind hears a reliable writer; a reliable reader hears no best-effort one, as
+    sensors are.
     """
     names = (name.replace("/", _SLASH) for name in (key, kind))
     qos = f":{int(role == PUBLISHER)}:0:0,10:typehash=RIHS01_{TYPES[kind]};"
@@ -149,9 +149,8 @@ class Ros2Settings(RobotSettings, frozen=True, kw_only=True):
                 f"endpoint {endpoint} is not for the ROS 2 side: it speaks plain text, as DDS does;"
                 " use tcp/ or udp/ on one machine, or inside a tunnel"
             )
-        topics = (self.twist_topic, self.odometry_topic)
-        if len({topic_key(self.namespace, topic) for topic in topics}) < len(topics):
-            raise UserError(f"ros2 has one topic for both, {self.twist_topic}: give two")
+        for topic in (self.twist_topic, self.odometry_topic):
+            topic_key(self.namespace, topic)
 
 
 class Ros2Core(streamed.StreamedCore):

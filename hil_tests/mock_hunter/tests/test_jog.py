@@ -397,9 +397,8 @@ def test_bad_input_leaves_no_report(flags):
 
 def test_the_real_driver_on_a_bus_crawls_falls_silent_and_is_refused(monkeypatch, tmp_path):
     """In real time: the stream's own thread falls silent. The other steps need no thread."""
-    names = ("feedback", "crawl", "link_watchdog", "rearm_refused")
+    names = ("feedback", "link_watchdog", "rearm_refused")
     monkeypatch.setattr(jog, "STEPS", [step for step in jog.STEPS if step[0] in names])
-    monkeypatch.setattr(jog, "CRAWLS_S", 0.2)
     orders, ending = Orders(), threading.Event()
     chassis = a_chassis()
     chassis.next_s = chassis._now_s = time.monotonic()
