@@ -233,5 +233,5 @@ class ProgressBar:
         is_due = now_s - self._line_s > LINE_INTERVAL_S or self.done >= self.total
         if self._bar.disable and is_due:
             self._line_s, left_s = now_s, self._bar.tasks[self._task].time_remaining
-            left = "" if left_s is None else f"{left_s / 60.0:.0f} min left  "
+            left = f"{left_s / 60.0:.0f} min left  " if left_s else ""
             print(f"{self.what}: {self.done}/{self.total}  {left}{text}", file=sys.stderr)

@@ -107,7 +107,7 @@ def _store(arguments: argparse.Namespace, study: Study) -> Store:
 def compute_missing(arguments: argparse.Namespace, store: Store, wanted: Sequence[Unit]) -> int:
     """Compute the units that have no current record; return how many failed."""
     if not wanted:
-        raise UserError(f"{', '.join(arguments.names)}: there is no such training")
+        raise UserError(f"{', '.join(arguments.names)}: nothing to compute")
     check_device(arguments.device)
     stop_at_s = deadline_s(arguments.max_minutes, time.time)  # The clock of all processes
     done = {*store.load(wanted, arguments.seeds).found}
