@@ -253,8 +253,10 @@ def test_nothing_but_a_stop_follows_what_is_too_old_or_wrong(sessions, needs_rea
 
 
 SOURCE = """
-import os, threading, time
+import pathlib, threading, time
 import numpy as np
+
+here = pathlib.Path(__file__).parent  # a thread that hangs outlives its test, and its folder
 
 class Source:
     speed_mps = 0.3
@@ -264,18 +266,18 @@ class Source:
         threading.Thread(target=threading.Event().wait).start()  # no daemon: it holds the exit
 
     def observe(self):
-        word = open("word").read()
+        word = (here / "word").read_text()
         if word == "raises":
             raise OSError("no such\\ncamera")
         if word == "hangs":
-            open("hanging", "w").close()
+            (here / "hanging").touch()
             threading.Event().wait()
         if word == "late":
             time.sleep(0.4)
         return {"frames": self.random.integers(0, 99, (2, 45, 80), np.uint8)}
 
     def episode_over(self):
-        return open("word").read() == "over"
+        return (here / "word").read_text() == "over"
 
 class Later(Source):
     count = 0  # the first observation is good
@@ -286,7 +288,7 @@ class Later(Source):
     def observe(self):
         self.count += 1
         if self.count == 2:
-            open("word", "w").write(open("then").read())
+            (here / "word").write_text((here / "then").read_text())
         return super().observe()
 
 class Few(Later):  # one state in time, one too late, and then nothing that can be read
