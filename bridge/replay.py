@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from bridge.ports import add_options
 from bridge.recording import Recording, choose_vehicle, valid_messages
+from bridge.report import write_figure
 from edge_runtime.cli import ArgumentParser, examples, not_negative_number
 from edge_runtime.config import BUILT_IN, NONE, Config, add_trust, load_config
 from edge_runtime.controller import (
@@ -39,6 +40,7 @@ CLOCK_STEP_S = 1.0  # Stamps that leap by more against the recorder's: a clock w
 DEFAULT_TOLERANCE = 1e-5  # Two processors round differently, by far less than this
 DIFFERENT = 1  # Exit status where at least one command differs
 SHOWN_DIFFERENCES = 10
+MOST_PANELS = 8  # Of a picture, one an action
 
 Key = tuple[str, int, int]  # Session, episode, step
 
@@ -68,7 +70,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     apart = "largest difference of two equal actions, in the unit of the action"
     kind = not_negative_number
     add("--tolerance", metavar="X", type=kind, default=DEFAULT_TOLERANCE, help=apart)
-    add_options(parser, "--out")
+    out = "report to write, as JSON, and beside it a picture R.png of recorded and replayed actions"
+    add_options(parser, "--out", help=out)
 
 
 def run(arguments: Any) -> int:
@@ -76,8 +79,12 @@ def run(arguments: Any) -> int:
     drive = RecordedDrive(Path(arguments.recording), arguments.vehicle_id)
     policy = load_policy(arguments.policy, arguments.public_key, arguments.allow_unsigned)
     config = load_config(arguments.config, {"policy": arguments.policy}, opens_link=False)
-    report = report_replay(drive, policy, config, arguments.tolerance)
+    rows = [*replay(drive, policy, config)]
+    report = report_on(drive, policy, rows, arguments.tolerance)
     write_json_out(arguments.out, report)
+    if arguments.out:
+        names = [row.name for row in policy.manifest.action]
+        write_figure(draw(rows, names), Path(arguments.out).with_suffix(".png"))
     print(
         f"{report['compared']} commands compared, {report['different']} differ; largest difference"
         f" {report['largest_difference']:.3g}, tolerance {report['tolerance']:g};"
@@ -89,15 +96,18 @@ def run(arguments: Any) -> int:
     return DIFFERENT if report["different"] else 0
 
 
-def report_replay(
-    drive: RecordedDrive, policy: Policy, config: Config, tolerance: float = DEFAULT_TOLERANCE
+def report_on(
+    drive: RecordedDrive,
+    policy: Policy,
+    rows: Iterable[Row],
+    tolerance: float = DEFAULT_TOLERANCE,
 ) -> dict[str, Any]:
-    """Replay a drive; return the command's report. UserError where nothing can be compared."""
+    """Return the command's report on what `replay` gave. UserError where nothing is compared."""
     report = {
         "recording": str(drive.recording.path),
         "policy_id": policy.policy_id,
         "recorded_policy_ids": sorted({each.command.policy_id for each in drive.answers.values()}),
-        **compare(replay(drive, policy, config), tolerance),
+        **compare(rows, tolerance),
     }
     if report["compared"] == 0:
         raise UserError(f"{drive.recording.path} holds no state with an answer of its policy")
@@ -283,6 +293,25 @@ def compare(rows: Iterable[Row], tolerance: float) -> dict[str, Any]:
         "by_recorded": dict(kinds),
         "first_differences": differences[:SHOWN_DIFFERENCES],
     }
+
+
+def draw(rows: Iterable[Row], names: Sequence[str]) -> Any:
+    """Draw the recorded and the replayed answers, state by state: a panel an action."""
+    from matplotlib.figure import Figure
+
+    answers = [(recorded.action, order.action if order else ())
+               for _, recorded, order in rows if recorded]  # fmt: skip
+    names = names[:MOST_PANELS]
+    figure = Figure(figsize=(10, 1 + 1.8 * len(names)), layout="constrained")
+    panels = figure.subplots(len(names), squeeze=False, sharex=True)[:, 0]
+    for place, (name, panel) in enumerate(zip(names, panels, strict=True)):
+        for number, look in enumerate(({"label": "recorded"}, {"label": "replayed", "ls": "--"})):
+            values = [[*each[number], *[math.nan] * len(names)][place] for each in answers]
+            panel.plot(values, **look)
+        panel.set_ylabel(name)
+    panels[0].legend(fontsize=8)
+    panels[-1].set_xlabel("answered states, in their order")
+    return figure
 
 
 def _told(answer: Command | Order) -> dict[str, Any]:

@@ -4,7 +4,9 @@ import json
 import sys
 
 import pytest
+from PIL import Image
 
+from bridge import replay as replay_module
 from bridge.tests.recordings import ANSWER_S, SILENCE, Hand, bridge_status, flip_chunk, ns
 from hil_tests.tests.shared.drives import make_policy
 from hil_tests.tests.shared.messages import WHITE, frames, make_state
@@ -16,6 +18,13 @@ NOT_ARMED = {"mode": "safe_stop", "reason": "not_armed", "action": [-1.0]}
 @pytest.fixture
 def hand(tmp_path):
     return Hand(tmp_path / "by_hand.mcap")
+
+
+@pytest.fixture(autouse=True)
+def no_pictures(monkeypatch):
+    """They take longer than the replays."""
+    monkeypatch.setattr(replay_module, "draw", lambda *_: None)
+    monkeypatch.setattr(replay_module, "write_figure", lambda *_: None)
 
 
 def replay(hand, policy=None, *options):
@@ -49,6 +58,16 @@ def test_another_policy_differs_and_the_tolerance_decides(hand, tmp_path):
     assert (first["session"], first["episode"], first["step"]) == ("here", 0, 0)
     assert first["recorded"] == {"mode": "drive", "reason": "", "action": [0.3]}
     assert replay(hand, policy, "--tolerance", "0.02")[0] == 0
+
+
+def test_what_differs_is_drawn_beside_the_report(hand, tmp_path, monkeypatch):
+    monkeypatch.undo()
+    for policy, action in ((None, [0.3]), (make_policy(tmp_path, "nan", 0.3), [0.3, 0.4])):
+        hand = Hand(tmp_path / f"{len(action)}.mcap")
+        hand.drive(0, 5, action=action)
+        replay(hand, policy)
+        with Image.open(hand.path.with_suffix(".png")) as picture:
+            assert picture.size == (1100, 308)
 
 
 def braked_gap(hand):

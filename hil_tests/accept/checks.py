@@ -14,11 +14,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from bridge import replay as replaying
 from bridge.environments import NOMINAL
 from bridge.network import LatencySpec
 from bridge.outcomes import GOAL, Estimate, success_estimate
 from bridge.recording import Recording, valid_messages
-from bridge.replay import RecordedDrive, report_replay
 from deploy.bundle import UNATTENDED
 from edge_runtime.config import BUILT_IN, NONE, Config
 from edge_runtime.policy import Policy
@@ -264,7 +264,8 @@ def in_real_time(job: Job) -> Found:
 
 def replay(path: str | Path, job: Job) -> Found:
     assert job.policy is not None
-    report = report_replay(RecordedDrive(Path(path), None), job.policy, job.config)
+    drive = replaying.RecordedDrive(Path(path), None)
+    report = replaying.report_on(drive, job.policy, replaying.replay(drive, job.policy, job.config))
     others = [each[:12] for each in report["recorded_policy_ids"] if each != job.policy_id]
     wrong = [f"policy {', '.join(others)} made it"] if others else []
     wrong += [f"{report['different']} answers differ"] if report["different"] else []
