@@ -97,10 +97,7 @@ def run(arguments: Any) -> int:
 
 
 def report_on(
-    drive: RecordedDrive,
-    policy: Policy,
-    rows: Iterable[Row],
-    tolerance: float = DEFAULT_TOLERANCE,
+    drive: RecordedDrive, policy: Policy, rows: Iterable[Row], tolerance: float = DEFAULT_TOLERANCE
 ) -> dict[str, Any]:
     """Return the command's report on what `replay` gave. UserError where nothing is compared."""
     report = {

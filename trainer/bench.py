@@ -1,7 +1,4 @@
-"""Measure the learner, the environments and a training on this machine.
-
-On a GPU also Stable-Baselines3's TD3, in turn with ours, so that other work hits both alike.
-"""
+"""Measure the learner, the environments and a training; on a GPU Stable-Baselines3's TD3, too."""
 
 import argparse
 import contextlib
@@ -78,10 +75,7 @@ def measure(device: str = "cpu", batch_size: int = LearnerConfig.batch_size) -> 
 
 
 def in_turn(contenders: dict[str, Callable[[], int]]) -> dict[str, float]:
-    """Return the median over rounds of each contender's seconds; one more round is not counted.
-
-    Its seconds for a piece: a contender returns how many it has done.
-    """
+    """Return each contender's median seconds for a piece; it returns how many it has done."""
     times: dict[str, list[float]] = {name: [] for name in contenders}
     for _ in range(1 + ROUNDS):
         for name, work in contenders.items():
@@ -153,20 +147,14 @@ def on_a_gpu(run: TrainingRun) -> dict[str, Any]:
         recorded.replay()
         torch.cuda.synchronize()
 
-    def drive(steps: int = 10 * UPDATES) -> int:
-        model.learn(steps, reset_num_timesteps=False)
-        return steps
-
-    ours, theirs = (
-        whole_update(run.learning),
-        partial(model.train, 1, run.config.learner.batch_size),
-    )
+    ours, steps = whole_update(run.learning), 10 * UPDATES
+    theirs = partial(model.train, 1, run.config.learner.batch_size)
     median_s = in_turn({
         "replay": partial(repeated, replay, UPDATES),
         "update": partial(run.learning.in_thread, repeated, ours, UPDATES),
-        "update_of_stable_baselines3": partial(repeated, theirs, UPDATES),
+        "update_of_sb3": partial(repeated, theirs, UPDATES),
         "step": lambda: run.advance().steps,
-        "step_of_stable_baselines3": drive,
+        "step_of_sb3": lambda: model.learn(steps, reset_num_timesteps=False) and steps,
     })  # fmt: skip
     return {"gpu": torch.cuda.get_device_name(),
             **{f"ms_per_{name}": 1e3 * piece_s for name, piece_s in median_s.items()}}  # fmt: skip

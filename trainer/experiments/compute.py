@@ -75,11 +75,9 @@ def run(arguments: argparse.Namespace) -> int:
     if alone and len(names) > 1 and names != {"status", study.name}:
         raise UserError(f"{', '.join(sorted(alone))}: no other name goes with it")
     store = _store(arguments, study)
-    kind = arguments.algorithm, arguments.setting
-    units = [
-        unit for unit in store.study.units(seeds, arguments.scenario, names)
-        if all(wanted in (None, own) for wanted, own in zip(kind, unit[1:3], strict=True))
-    ]  # fmt: skip
+    row, setting = arguments.algorithm, arguments.setting
+    units = [unit for unit in store.study.units(seeds, arguments.scenario, names)
+             if row in (None, unit.algorithm) and setting in (None, unit.setting)]  # fmt: skip
     if "status" in names:
         there = store.load(units, seeds)
         done = Counter(unit[:3] for unit in there.found)

@@ -1,8 +1,4 @@
-"""A step of learning that a GPU records once and replays: no Python between its kernels.
-
-Replayed, a step of some 300 kernels takes as long as they compute; begun from Python one by one,
-twenty times as long.
-"""
+"""A step of learning that a GPU records once and replays, without Python between its kernels."""
 
 from collections.abc import Callable
 from typing import Any
@@ -17,9 +13,8 @@ WARM_UPS = 3  # Calls that run as they are, so that libraries and optimisers hav
 class RecordedStep:
     """Calls ``step(batch)``, from the fourth call on by a replay of its kernels.
 
-    ``step`` branches on nothing that its tensors hold and always uses the same memory beside
-    ``batch``, whose tensors, nested in named tuples and lists, have the same shapes in each call.
-    ``noise`` is the generator that it draws from.
+    ``step`` branches on nothing that a tensor holds, and a batch's tensors, nested in named tuples
+    and lists, always have the same shapes. ``noise`` is the generator that it draws from.
     """
 
     def __init__(self, step: Callable[[Any], Tensor], noise: torch.Generator) -> None:
@@ -40,8 +35,9 @@ class RecordedStep:
                 if self._batch is None:
                     self._record(batch)
                 else:
-                    for own, given in zip(_tensors(self._batch), _tensors(batch), strict=True):
-                        own.copy_(given)
+                    for own, given in zip(*map(tree_leaves, (self._batch, batch)), strict=True):
+                        if own is not None:
+                            own.copy_(given)
                 self._graph.replay()
                 result = self._result.clone()
         here.wait_stream(self._stream)
@@ -60,7 +56,3 @@ class RecordedStep:
 
     def _moved(self, batch: Any) -> Any:
         return tree_map_only(Tensor, lambda tensor: tensor.to(self._noise.device), batch)
-
-
-def _tensors(batch: Any) -> list[Tensor]:
-    return [leaf for leaf in tree_leaves(batch) if leaf is not None]

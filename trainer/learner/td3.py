@@ -193,10 +193,7 @@ class TD3Learner:
         )
 
     def _step(self, batch: Tensors, with_policy: bool) -> Tensor:
-        """Take a step; return the four losses and the batch's new priorities, [4 + n].
-
-        Branches on nothing that a tensor holds.
-        """
+        """Take a step; return the four losses and the batch's new priorities, [4 + n]."""
         batch = batch._replace(
             seen=self._shifted(batch.seen), next_seen=self._shifted(batch.next_seen)
         )
@@ -278,13 +275,13 @@ class TD3Learner:
         left = 1.0 - (1.0 - c.learning_rate_final) * min(progress, 1.0)
         for name in OPTIMISERS:
             fade = self._fade if name == "cloning_optimiser" else 1.0
-            for group in getattr(self, name).param_groups:
-                group["decayed_lr"] *= c.learning_rate_decay
-                rate = group["decayed_lr"] * left * fade
-                if self._on_gpu:
-                    group["lr"].fill_(rate)
-                else:
-                    group["lr"] = rate
+            (group,) = getattr(self, name).param_groups
+            group["decayed_lr"] *= c.learning_rate_decay
+            rate = group["decayed_lr"] * left * fade
+            if self._on_gpu:
+                group["lr"].fill_(rate)
+            else:
+                group["lr"] = rate
 
     def state_dict(self) -> dict[str, Any]:
         """Return weights, optimisers, noise and counters: all that a resumed run needs."""
@@ -311,8 +308,7 @@ class TD3Learner:
         made = torch.optim.Adam(
             network.parameters(), self._rate(rate), fused=True, capturable=self._on_gpu
         )
-        for group in made.param_groups:
-            group["decayed_lr"] = rate
+        made.param_groups[0]["decayed_lr"] = rate
         return made
 
     def _rate(self, rate: float) -> float | Tensor:

@@ -34,7 +34,7 @@ def test_a_gpus_report_has_the_other_library_and_the_floor(monkeypatch):
         monkeypatch.setattr(bench, name, small)
     found = bench.measure("cuda", batch_size=16)["on_gpu"]
     assert 0.0 < found["ms_per_replay"] < found["ms_per_update"]
-    assert found["ms_per_step_of_stable_baselines3"] > 0.0
+    assert found["ms_per_step_of_sb3"] > 0.0
 
 
 def test_the_other_library_drives_and_learns():
