@@ -94,7 +94,9 @@ def test_no_driver_is_given_more_than_the_bounds(vehicle):
         assert [*given[-1].values()] == pytest.approx(expected)
 
 
-@pytest.mark.parametrize("speeds", [(-1.0, None), (0.0, 1.0), (0.5, 1.0), (-1.0, math.nan)])
+@pytest.mark.parametrize(
+    "speeds", [(-1.0, None), (0.0, 1.0), (0.5, 1.0), (0.0, -1.0), (-1.0, math.nan)]
+)
 def test_only_enable_gives_a_new_leash(vehicle, speeds):
     """Odometry that says too little is not believed, where the driver tells what is asked."""
     vehicle.take_bounds(Bounds(leash_m=0.3))

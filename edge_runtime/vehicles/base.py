@@ -337,7 +337,7 @@ class VehicleRunner:
             report = _plain(self._vehicle.feedback(time.monotonic()), self._action_names)
             self._watch.report(report, time.monotonic())
             # Odometry may say 0, or half: what is asked for is the second witness.
-            most_mps = max(abs(report.speed_mps), report.commanded_speed_mps or 0.0)
+            most_mps = max(abs(report.speed_mps), abs(report.commanded_speed_mps or 0.0))
             self.leash.note(most_mps, time.monotonic())
         except BaseException as error:
             if not self._fails:
