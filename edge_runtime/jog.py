@@ -258,10 +258,8 @@ def walk(jog: Jog, rows: List[Dict[str, str]]) -> None:
     over = ""
     for name, needs, moves, expected, do in STEPS:
         lacks = [need.replace("_", " ") for need in needs if need not in jog.has]
-        result, measured = (
-            NOT_TRIED,
-            over or ", ".join(f"the driver knows of no {it}" for it in lacks),
-        )
+        measured = over or ", ".join(f"the driver knows of no {it}" for it in lacks)
+        result = NOT_TRIED
         if not measured:
             try:
                 jog.ask(name, f"what moves: {moves}")
