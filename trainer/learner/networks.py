@@ -176,7 +176,9 @@ class Convolutions(nn.Module):
         return self.layers(scaled.reshape(-1, *self.shape))
 
     def _channels_first(self, seen: Tensor) -> Tensor:
-        return seen.permute(0, 3, 1, 2) if self.last else seen.reshape(-1, *self.shape)
+        # A copy, or gradients have the observation's strides, and a fused Adam takes them for the
+        # weights' own.
+        return seen.permute(0, 3, 1, 2).contiguous() if self.last else seen.reshape(-1, *self.shape)
 
 
 class Entries(nn.Module):

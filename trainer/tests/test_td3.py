@@ -10,6 +10,7 @@ from typing import cast
 import numpy as np
 import pytest
 import torch
+from gymnasium.spaces import Box
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from trainer.learner import networks
@@ -69,6 +70,20 @@ def test_pictures_are_shifted_by_some_pixels_and_by_no_more():
         assert len(places) == 1
         seen.update(places)
     assert len(seen) > (2 * most + 1) ** 2 / 2
+
+
+def test_a_picture_is_learned_from_alike_where_its_channels_come_first_and_last():
+    weights = []
+    frames = np.random.default_rng(0).integers(0, 255, (12, 3, 20, 24)).astype(np.uint8)
+    for last in (False, True):
+        seen = np.ascontiguousarray(np.moveaxis(frames, 1, -1)) if last else frames
+        learner = TD3Learner(
+            replace(SMALL, picture_shift=2), PHIL, 0, space=Box(0, 255, seen.shape[1:], np.uint8)
+        )
+        learner.update(replace(make_batch(), frames=seen, next_frames=seen))
+        weights.append(weights_of(learner))
+    for name, flat in weights[0].items():
+        assert (flat - weights[1][name]).abs().max() < 1e-6, name
 
 
 @pytest.fixture
