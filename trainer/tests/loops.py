@@ -1,7 +1,6 @@
 """The training loop on a scripted road, with a scripted human and a learner that only listens."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -104,7 +103,7 @@ def scripted_run(run_dir, config=CONFIG, length=1, outcome="goal", human_steps=(
     """A run that keeps what it ``stored``, and the (indices, priorities) that it was given
     (``learned``) and wrote back (``written``)."""
     env = ScriptedEnv(length, outcome)
-    learning = LearningThread(config, env)
+    learning: Any = LearningThread(config, env)
     validation = Validation(config, run_dir, learning, env)
     guide = ScriptedGuide(human_steps, reason)
     run: Any = TrainingRun(config, run_dir, False, env, guide, learning, validation)
@@ -125,10 +124,10 @@ def scripted_run(run_dir, config=CONFIG, length=1, outcome="goal", human_steps=(
         run.learned.append((batch.indices.tolist(), priorities.tolist()))
         return torch.tensor([0.0, 0.0, 0.0, 0.0, *priorities])
 
-    changed: Any = SimpleNamespace(learner=learning.learner, replay=learning.replay)
-    changed.replay.add, changed.replay.update_priorities = spy_add, spy_write
-    changed.learner.actor.act = lambda seen: np.full((len(seen), 1), POLICY, np.float32)
-    changed.learner.begin = begin
+    learning.replay.add, learning.replay.update_priorities = spy_add, spy_write
+    for actor in (learning.learner.actor, learning._acting):
+        actor.act = lambda seen: np.full((len(seen), 1), POLICY, np.float32)
+    learning.learner.begin = begin
     return run
 
 

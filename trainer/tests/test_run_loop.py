@@ -120,7 +120,7 @@ def bad_update(run):
 
 
 def bad_action(run):
-    run.learning.learner.actor.act = lambda _: np.array([[np.nan]], np.float32)
+    run.learning._acting.act = lambda _: np.array([[np.nan]], np.float32)
 
 
 def bad_weights(run):

@@ -49,7 +49,8 @@ class LearningThread:
 
     The policy acts in that thread, too: another would bring a second pool of OpenMP threads, and
     the two would fight for the same cores. The networks are on the config's device. Replay, and the
-    actor that acts, are in the processor's memory: it answers one observation sooner than a GPU.
+    copy of the actor that acts, are in the processor's memory: it answers one observation sooner
+    than a GPU.
     """
 
     def __init__(self, config: RunConfig, env: Any) -> None:
@@ -75,9 +76,7 @@ class LearningThread:
         # many times as long for those: 3 ms a step instead of 1. To a weight they add nothing.
         # First of all in this thread, so that the kernel's OpenMP threads inherit it.
         self._thread = ThreadPoolExecutor(1, "learner", torch.set_flush_denormal, (True,))
-        self._acting = self.learner.actor
-        if self.learner.device.type != "cpu":
-            self._acting = copy.deepcopy(self._acting).cpu()
+        self._acting = copy.deepcopy(self.learner.actor).cpu()
         self._begun: Future[tuple[list[Batch], list[Losses], float]] | None = None
         self._scenario = config.scenario
         self._fitted, self._renewed = False, 0
@@ -145,6 +144,7 @@ class LearningThread:
         began_s = time.perf_counter()
         update, self._begun = self._begun, None
         batches, done, learning_s = update.result()
+        self._follow()
         if not all(np.isfinite(losses.priorities).all() for losses in done):
             raise diverged("losses")
         waited_s = time.perf_counter() - began_s
@@ -223,13 +223,11 @@ class LearningThread:
             batches.append(self.replay.sample(self.config.batch_size, self._random))
             begun.append(self.learner.begin(batches[-1], beta))
         losses = [Losses.of(figures) for figures in begun]
-        self._follow()
         return batches, losses, time.perf_counter() - began_s
 
     def _follow(self) -> None:
         """Act by the actor's present weights."""
-        if self._acting is not self.learner.actor:
-            self._acting.load_state_dict(self.learner.actor.state_dict())
+        self.in_thread(lambda: self._acting.load_state_dict(self.learner.actor.state_dict()))
 
     def _forget_losses(self) -> None:
         self._losses: list[tuple[float, ...]] = []
@@ -239,19 +237,18 @@ class LearningThread:
 class UnhurriedLearning(LearningThread):
     """A learner beside a person: ``act``, ``begin`` and ``finish`` never wait for an update.
 
-    The policy acts in the loop's thread, from a copy of the actor as of the last finished update.
+    The policy acts in the loop's thread, as of the last finished update.
     An episode's steps are stored at its end, when it is known whether the person discards it.
     """
 
     def __init__(self, config: RunConfig, env: Any) -> None:
         super().__init__(config, env)
-        self._actor = copy.deepcopy(self._acting).eval()
         self._kept: list[Transition] = []
         # That thread alone
         self.in_thread(lambda: os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS))
 
     def act(self, observation: Observation) -> Action:
-        return self._actor.act(observation[None])[0]
+        return self._acting.act(observation[None])[0]
 
     def add(self, transition: Transition) -> None:
         self._kept.append(transition)
@@ -279,10 +276,6 @@ class UnhurriedLearning(LearningThread):
         self.settle()
         return super().state_dict()
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        super().load_state_dict(state)
-        self._actor.load_state_dict(self._acting.state_dict())
-
     def settle(self) -> None:
         # In short waits: a signal that another thread took does not wake the main thread.
         while not self._tidy():
@@ -294,5 +287,4 @@ class UnhurriedLearning(LearningThread):
             if not self._begun.done():
                 return False
             super().finish()
-            self._actor.load_state_dict(self._acting.state_dict())
         return True
