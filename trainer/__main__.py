@@ -210,7 +210,8 @@ def experiment(parser: argparse.ArgumentParser) -> None:
     add("--seeds", type=cli.whole_number(1, 1000), default=plan.DEFAULT_SEEDS, help=seeds)
     add("--scenario", choices=list(plan.TASKS), help="compute this task only (default: all)")
     add("--algorithm", choices=list(plan.LABELS), metavar="NAME", help="and this row only")
-    add("--setting", choices=list(plan.SETTINGS), metavar="NAME", help="and this setting only")
+    settings = "and these settings only"
+    add("--setting", nargs="+", choices=list(plan.SETTINGS), metavar="NAME", help=settings)
     quick = "train for a few steps, in RUNS/quick: a trial whose numbers mean nothing"
     add("--quick", action="store_true", help=quick)
     how = parser.add_argument_group("how it is computed")

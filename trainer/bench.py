@@ -149,7 +149,7 @@ def on_a_gpu(run: TrainingRun) -> dict[str, Any]:
 
     ours, steps = whole_update(run.learning), 10 * UPDATES
     theirs = partial(model.train, 1, run.config.learner.batch_size)
-    median_s = in_turn({
+    each_s = in_turn({
         "replay": partial(repeated, replay, UPDATES),
         "update": partial(run.learning.in_thread, repeated, ours, UPDATES),
         "update_of_sb3": partial(repeated, theirs, UPDATES),
@@ -157,7 +157,7 @@ def on_a_gpu(run: TrainingRun) -> dict[str, Any]:
         "step_of_sb3": lambda: model.learn(steps, reset_num_timesteps=False) and steps,
     })  # fmt: skip
     return {"gpu": torch.cuda.get_device_name(),
-            **{f"ms_per_{name}": 1e3 * piece_s for name, piece_s in median_s.items()}}  # fmt: skip
+            **{f"ms_per_{name}": 1e3 * piece_s for name, piece_s in each_s.items()}}  # fmt: skip
 
 
 def stable_baselines3(config: RunConfig) -> Any:

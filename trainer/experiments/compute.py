@@ -75,9 +75,9 @@ def run(arguments: argparse.Namespace) -> int:
     if alone and len(names) > 1 and names != {"status", study.name}:
         raise UserError(f"{', '.join(sorted(alone))}: no other name goes with it")
     store = _store(arguments, study)
-    row, setting = arguments.algorithm, arguments.setting
+    row, settings = arguments.algorithm, arguments.setting or plan.SETTINGS
     units = [unit for unit in store.study.units(seeds, arguments.scenario, names)
-             if row in (None, unit.algorithm) and setting in (None, unit.setting)]  # fmt: skip
+             if row in (None, unit.algorithm) and unit.setting in settings]  # fmt: skip
     if "status" in names:
         there = store.load(units, seeds)
         done = Counter(unit[:3] for unit in there.found)

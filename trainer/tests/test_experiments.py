@@ -350,9 +350,11 @@ class TestCommand:
         assert "constant actions in the left turn is" in (results / "README.md").read_text()
         assert "1 of 1 units were there already" in call(capsys, "experiment", "floor", *more)[1]
 
-    def test_one_row_in_one_setting_can_be_chosen(self, capsys):
-        chosen = ("--algorithm", "phil_td3", "--setting", "four_updates")
-        assert len(call(capsys, "experiment", "guidance", "status", *chosen)[1].splitlines()) == 3
+    @pytest.mark.parametrize("settings", [["late"], ["four_updates", "sixteen_updates"]])
+    def test_one_row_in_some_settings_can_be_chosen(self, capsys, settings):
+        chosen = ("--algorithm", "phil_td3", "--setting", *settings)
+        said = call(capsys, "experiment", "guidance", "status", *chosen)[1].splitlines()
+        assert {line.split()[0] for line in said[:-1]} == {*settings}
         refusal(capsys, "experiment", "guidance", "--setting", "printed")
 
     @pytest.mark.parametrize("names", ["status report", "guidance fig7"])
