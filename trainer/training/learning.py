@@ -227,7 +227,10 @@ class LearningThread:
 
     def _follow(self) -> None:
         """Act by the actor's present weights."""
-        self.in_thread(lambda: self._acting.load_state_dict(self.learner.actor.state_dict()))
+        self.in_thread(self._copy_actor)
+
+    def _copy_actor(self) -> None:
+        self._acting.load_state_dict(self.learner.actor.state_dict())
 
     def _forget_losses(self) -> None:
         self._losses: list[tuple[float, ...]] = []
@@ -275,6 +278,9 @@ class UnhurriedLearning(LearningThread):
     def state_dict(self) -> dict[str, Any]:
         self.settle()
         return super().state_dict()
+
+    def _follow(self) -> None:
+        self._copy_actor()  # Nice as it is, the thread may let the loop wait.
 
     def settle(self) -> None:
         # In short waits: a signal that another thread took does not wake the main thread.
