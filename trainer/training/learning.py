@@ -230,7 +230,9 @@ class LearningThread:
         self.in_thread(self._copy_actor)
 
     def _copy_actor(self) -> None:
-        self._acting.load_state_dict(self.learner.actor.state_dict())
+        copies, weights = (list(actor.state_dict().values()) for actor in
+                           (self._acting, self.learner.actor))  # fmt: skip
+        torch._foreach_copy_(copies, weights)
 
     def _forget_losses(self) -> None:
         self._losses: list[tuple[float, ...]] = []
