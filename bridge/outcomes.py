@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from statistics import NormalDist
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -45,8 +46,7 @@ def settled(outcomes: Iterable[str]) -> list[str]:
     return [TIMEOUT if told and each == TRUNCATED else each for each in outcomes]
 
 
-CONFIDENCE = 0.95
-TAIL = 0.5 * (1.0 - CONFIDENCE)  # Outside each end of an interval
+UPPER = 0.975  # Quantile at the upper end of an interval
 
 
 class Estimate(NamedTuple):
@@ -81,14 +81,14 @@ def mean_estimate(values: Iterable[float]) -> Estimate:
     count, mean = len(numbers), float(numbers.mean()) if len(numbers) else np.nan
     if count < 2:
         return Estimate(mean, -np.inf, np.inf, count)
-    from scipy import stats  # Slow to load
+    from scipy.special import stdtrit  # Slow to load; scipy.stats takes a second
 
-    reach = float(stats.t.ppf(1.0 - TAIL, count - 1) * stats.sem(numbers))
+    reach = float(stdtrit(count - 1, UPPER) * numbers.std(ddof=1) / np.sqrt(count))
     return Estimate(mean, mean - reach, mean + reach, count)
 
 
 def success_estimate(successes: int, count: int) -> Estimate:
-    from scipy import stats
-
-    interval = stats.binomtest(successes, count).proportion_ci(CONFIDENCE, method="wilson")
-    return Estimate(successes / count, float(interval.low), float(interval.high), count)
+    z2, failures = NormalDist().inv_cdf(UPPER) ** 2, count - successes
+    reach = (z2 * (successes * failures / count + z2 / 4)) ** 0.5  # Wilson's interval
+    low, high = ((part + z2 / 2 - reach) / (count + z2) for part in (successes, failures))
+    return Estimate(successes / count, low, 1.0 - high, count)
