@@ -1,12 +1,9 @@
 import json
 import math
-import os
 import signal
-import subprocess
-import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -17,24 +14,32 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from edge_runtime.cli import INTERRUPTED, run_cli
 from edge_runtime.util import UserError
-from hil_tests.processes import wait_until
 from trainer.__main__ import main
 from trainer.environments import make_environment
 from trainer.evaluation import BEST_FILE, CHECKPOINT_FILE, load_actor
 from trainer.human.guide import ASKED, Asking
 from trainer.learner.config import LearnerConfig
+from trainer.scenarios.left_turn import SCENES
 from trainer.tests.learners import same_weights
 from trainer.tests.loops import rows_of
 from trainer.training.command import check_directory
 from trainer.training.config import RunConfig
-from trainer.training.metrics import NAMES, read_metrics
+from trainer.training.metrics import NAMES, MetricsWriter, read_metrics
 from trainer.training.run import TrainingRun
 from trainer.util import load_torch, save_torch
 
 # Learning, the slowest part, begins late, and still before what a test looks at.
-SMALL = LearnerConfig(batch_size=4, replay_capacity=2000, warmup_steps=170, exploration_initial=1.0)
+SMALL = LearnerConfig(batch_size=4, replay_capacity=2000, warmup_steps=50, exploration_initial=1.0)
 TINY = RunConfig(seed=3, episodes=4, evaluation_runs=1, checkpoint_every=1, learner=SMALL)
-TINY = replace(TINY, evaluate_every_steps=190)  # after two and four episodes
+TINY = replace(TINY, evaluate_every_steps=60)  # after two and four episodes
+SHORT = replace(SCENES["nominal"], max_steps=30)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _short_episodes():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(SCENES, "nominal", SHORT)
+        yield
 
 
 def train(config: RunConfig, directory: Path, resume: bool = False) -> TrainingRun:
@@ -84,11 +89,11 @@ def test_the_same_seed_in_two_parts_gives_the_same_weights_and_metrics(trained, 
     assert rows_of(rest) == rows_of(trained)
 
 
-@pytest.mark.parametrize(("row", "warmup_steps"), [("phil_gated", 170), ("ppl_td3", 300)])
+@pytest.mark.parametrize(("row", "warmup_steps"), [("phil_gated", 50), ("ppl_td3", 80)])
 def test_a_robot_that_asks_or_foresees_goes_on_as_it_would_have(
     tmp_path, monkeypatch, row, warmup_steps
 ):
-    monkeypatch.setattr(Asking, "MEMORY", 60)
+    monkeypatch.setattr(Asking, "MEMORY", 20)
     human: dict[str, Any] = {"late_to_s": 0.8, "missed_share": 0.3}
     learner = replace(SMALL, warmup_steps=warmup_steps)
     config = replace(TINY, algorithm=row, learner=learner, **human)
@@ -107,27 +112,10 @@ def test_a_robot_that_asks_or_foresees_goes_on_as_it_would_have(
     assert rows_of(whole) == rows_of(rest)
 
 
-def command(directory: Path, *extra: str) -> list[str]:
-    settings = ("batch_size=4", "replay_capacity=2000", "warmup_steps=300", "checkpoint_every=1",
-                "evaluate_every_steps=0")  # fmt: skip
-    chosen = [part for setting in settings for part in ("--set", setting)]
-    return [
-        sys.executable, "-m", "trainer", "train", "--seed", "3", "--episodes", "5", "--threads",
-        "1", "--out", str(directory), *chosen, *extra,
-    ]  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory) -> Path:
-    directory = tmp_path_factory.mktemp("runs") / "whole"
-    assert run_cli(main, command(directory)[3:]) == 0
-    return directory
-
-
-def resume_and_compare(directory: Path, whole: Path, *extra: str) -> None:
-    assert run_cli(main, command(directory, "--resume", *extra)[3:]) == 0
-    a, b = (load_torch(d / CHECKPOINT_FILE) for d in (directory, whole))
-    assert a["episode"] == b["episode"] == len(read_metrics(directory)) == 5
+def resume_and_compare(directory: Path, whole: TrainingRun) -> None:
+    assert run_cli(main, ["train", "--out", str(directory), "--resume"]) == 0
+    a, b = (load_torch(d / CHECKPOINT_FILE) for d in (directory, whole.run_dir))
+    assert a["episode"] == b["episode"] == len(read_metrics(directory)) == TINY.episodes
     assert same_actors(*(each["learning"]["learner"]["actor"] for each in (a, b)))
 
 
@@ -152,13 +140,25 @@ def test_a_checkpoint_of_other_observations_or_with_crafted_fields_is_said_to_fi
         place[name] = kept
 
 
-def test_a_killed_run_resumes_and_ends_like_one_never_killed(tmp_path, whole):
-    process = subprocess.Popen(command(tmp_path), stderr=subprocess.DEVNULL)
-    wait_until(lambda: len(read_metrics(tmp_path)) >= 3, "three episodes", 120.0)
-    process.kill()
-    process.wait()
-    assert 3 <= len(read_metrics(tmp_path)) < 5, "killed too late to mean anything"
-    resume_and_compare(tmp_path, whole)
+def train_and_die(directory: Path) -> None:
+    """In the midst of the third episode, which its process does not survive."""
+    SCENES["nominal"] = SHORT
+    run = TrainingRun(TINY, directory)
+
+    def die(*_: Any) -> None:
+        if run.learning.replay.added == 75:
+            signal.raise_signal(signal.SIGKILL)
+
+    run.recorders.append(die)
+    run.train()
+
+
+def test_a_killed_run_resumes_and_ends_like_one_never_killed(tmp_path, trained):
+    process = get_context("spawn").Process(target=train_and_die, args=(tmp_path,))
+    process.start()
+    process.join()
+    assert (process.exitcode, len(read_metrics(tmp_path))) == (-signal.SIGKILL, 2)
+    resume_and_compare(tmp_path, trained)
 
 
 def test_a_run_that_was_killed_before_its_first_checkpoint_begins_anew(tmp_path):
@@ -174,21 +174,20 @@ def test_a_run_that_was_killed_before_its_first_checkpoint_begins_anew(tmp_path)
         check_directory(tmp_path, config, resume=True)
 
 
-def test_a_run_that_is_asked_to_end_keeps_all_its_episodes(tmp_path, whole):
+def test_a_run_that_is_asked_to_end_keeps_all_its_episodes(tmp_path, trained, monkeypatch):
     """Far from its next checkpoint."""
-    seldom = ("--set", "checkpoint_every=100")
+    seldom, add = replace(TINY, checkpoint_every=100), MetricsWriter.add
+    (tmp_path / "config.json").write_text(json.dumps(asdict(seldom)))
 
-    def interrupt():
-        wait_until(lambda: len(read_metrics(tmp_path)) >= 2, "two episodes", 120.0)
-        os.kill(os.getpid(), signal.SIGINT)
+    def interrupted(writer, metrics):
+        add(writer, metrics)
+        if metrics.episode == 1:
+            signal.raise_signal(signal.SIGINT)
 
-    with ThreadPoolExecutor(1) as pool:
-        pool.submit(interrupt)
-        assert run_cli(main, command(tmp_path, *seldom)[3:]) == INTERRUPTED
-    driven = len(read_metrics(tmp_path))
-    assert 2 <= driven < 5
-    assert load_torch(tmp_path / CHECKPOINT_FILE)["episode"] == driven
-    resume_and_compare(tmp_path, whole, *seldom)
+    monkeypatch.setattr(MetricsWriter, "add", interrupted)
+    assert run_cli(main, ["train", "--out", str(tmp_path), "--resume"]) == INTERRUPTED
+    assert load_torch(tmp_path / CHECKPOINT_FILE)["episode"] == len(read_metrics(tmp_path)) == 2
+    resume_and_compare(tmp_path, trained)
 
 
 def test_a_deadline_ends_a_run_with_a_checkpoint_and_no_validation_of_its_own(tmp_path):
