@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from hil_tests.tests.shared.commands import call, refusal
+from trainer.__main__ import seeds
 from trainer.training import curves
 from trainer.training.metrics import EpisodeMetrics, MetricsWriter, read_metrics
 
@@ -64,11 +65,14 @@ def test_each_algorithm_is_a_line_named_with_a_band_up_to_the_shortest_run(tmp_p
     assert set(alone.get_ydata()) == {5.0}
 
 
-def test_several_seeds_are_trained_side_by_side_and_drawn(tmp_path, capsys):
+def test_seeds_are_trained_in_processes_of_their_own_and_drawn(tmp_path, capsys):
+    """The second; the first as any other run, here, where all is loaded."""
+    assert [*seeds("1-3")] == [1, 2, 3]
     few = ("--set", "evaluation_runs=2", "--set", "evaluate_every_steps=100")
     judged = (*few, "--success", f"{__name__}:good")
-    status, out, _ = call(capsys, *TRAIN, "--seeds", "1-2", *judged, "--out", tmp_path)
-    assert (status, len(out.splitlines())) == (0, 2)
+    for where in (("--seeds", "2", "--out", tmp_path), ("--out", tmp_path / "seed_1")):
+        status, out, _ = call(capsys, *TRAIN, *where, *judged)
+        assert (status, len(out.splitlines())) == (0, 1)
     for seed in (1, 2):
         (row,) = read_metrics(tmp_path / f"seed_{seed}")
         assert (row["outcome"], row["validation_success"]) == ("goal", "1.0")
