@@ -1,5 +1,6 @@
 import json
 import signal
+from concurrent.futures import ProcessPoolExecutor, wait
 from itertools import repeat
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from bridge.outcomes import STOPPED
 from hil_tests.tests.shared.commands import call, refusal
 from trainer.evaluation import BEST_FILE, CHECKPOINT_FILE
 from trainer.person import Reading
+from trainer.person import run as person_run
 from trainer.person.recording import find_recordings, read_steps
 from trainer.person.tests.people import (
     LET_GO,
@@ -94,7 +96,17 @@ class UntilChecked(Puppet):
         return hold(1.0) if seen.step % 20 == 10 else LET_GO
 
 
-def test_the_policy_is_validated_behind_the_persons_back_and_kept(sit_down):
+class Prompt(ProcessPoolExecutor):
+    """Has answered before the next step: all that is trained meanwhile takes a processor."""
+
+    def submit(self, *work):
+        future = super().submit(*work)
+        wait([future])
+        return future
+
+
+def test_the_policy_is_validated_behind_the_persons_back_and_kept(sit_down, monkeypatch):
+    monkeypatch.setattr(person_run, "ProcessPoolExecutor", Prompt)
     settings = "warmup_steps=8", "evaluate_every_steps=20", "evaluation_runs=2", "batch_size=4"
     quick = ["--threads", "1", *(word for name in settings for word in ("--set", name))]
     person = UntilChecked()
