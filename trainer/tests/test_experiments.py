@@ -1,9 +1,8 @@
 import json
-import multiprocessing
+import os
 import re
 import signal
 import time
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
@@ -19,6 +18,7 @@ from bridge.outcomes import COLLISION, GOAL
 from edge_runtime.util import UserError
 from hil_tests.tests.shared.commands import call, refusal
 from trainer import experiments as plan
+from trainer import util
 from trainer.environments import CONDITIONS, make_environment
 from trainer.evaluation import BEST_FILE, CHECKPOINT_FILE
 from trainer.experiments import GUIDANCE, PAPER, Line, Unit, compute, records, report
@@ -126,23 +126,10 @@ class TestUnit:
         assert not (straight.run_dir(UNIT) / CHECKPOINT_FILE).exists()
         assert str(straight.runs) not in (straight.run_dir(UNIT) / RECORD_FILE).read_text()
 
-    def test_a_killed_one_ends_the_command_and_goes_on_to_the_same_record(self, store, straight):
-        def killed():
-            (ends,) = [compute.run_here([Job(UNIT, store)], 1)]
-            with ThreadPoolExecutor(1) as pool:
-                end = pool.submit(next, ends)
-                while not (store.run_dir(UNIT) / CHECKPOINT_FILE).exists():
-                    assert not end.done()
-                    time.sleep(0.02)
-                for process in multiprocessing.active_children():
-                    process.kill()
-                end.result()
-
-        with pytest.raises(UserError):
-            killed()
-        assert not store.load([UNIT], 1).found
-        assert compute.compute(Job(UNIT, store)) == FINISHED
-        assert record_of(store) == record_of(straight)
+    def test_a_process_that_dies_ends_the_command(self, store, monkeypatch):
+        monkeypatch.setattr(util, "begin_process", os._exit)
+        with pytest.raises(UserError, match="goes on"):
+            list(compute.run_here([Job(UNIT, store)], 1))
 
     def test_one_that_is_out_of_time_goes_on_to_the_same_record(self, store, straight):
         """Stopped before its time began, and in the midst of it."""
@@ -151,7 +138,7 @@ class TestUnit:
         assert record_of(store) == record_of(straight)
 
     def test_a_foreign_task_is_learned_and_reported_beside_its_expert(self, tmp_path, one_thread):
-        store = store_in(tmp_path, GUIDANCE.quick())
+        store = store_in(tmp_path, replace(GUIDANCE.quick(), learner=TINY.learner))
         units = [Unit("hill", name, "good", seed) for name, seed in (("expert", 0), ("ia_td3", 1))]
         for unit in units:
             assert compute.compute(Job(unit, store)) == FINISHED
