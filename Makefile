@@ -28,9 +28,10 @@ demo: $(STAMP)  ## train with a human's guidance, export, and drive through a se
 	$(BIN)/python -m hil_tests demo
 
 # Tests often wait for processes, so that two cores serve four workers. A test's networks are small:
-# where each process computes with all cores, threads only wait for each other.
+# where each process computes with all cores, threads only wait for each other. And each process
+# would compile all modules anew where the environment forbids to keep them.
 test: $(STAMP)  ## with real processes and real Zenoh sessions; all but Ray's and the board's
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder
+	OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder
 
 test-ray: $(STAMP)  ## experiments on a local Ray cluster of several nodes
 	$(BIN)/python -m pip install --quiet --constraint requirements/workstation.txt --editable '.[ray]'
