@@ -45,7 +45,7 @@ def _in_the_root(monkeypatch):
     ("scenario", "condition", "spec", "runs"),
     [
         *(("left_turn", "nominal", spec, 3) for spec in (NONE, LATE, BAD)),
-        ("congestion", "variant", NONE, 2),
+        ("congestion", "variant", NONE, 1),
     ],
 )
 def test_lock_step_is_the_drive_in_process_to_the_bit(tmp_path, scenario, condition, spec, runs):
