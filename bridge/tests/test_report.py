@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 
 from bridge import report as reports
+from bridge.outcomes import mean_estimate, success_estimate
 from bridge.report import ProgressBar
 
 RESULT = reports.EpisodeResult(0, "goal", 21.0, 1.0, 12.3, 0.0, None, 123)
@@ -45,6 +46,12 @@ def test_a_limit_of_steps_is_a_timeout_where_another_episode_tells(outcomes, suc
     report = report_of(outcomes)
     assert [row["outcome"] for row in report["per_episode"]] == settled
     assert report["success_rate"] == success
+
+
+def test_intervals_are_wilsons_and_students():
+    assert success_estimate(9, 10)[:3] == pytest.approx((0.9, 0.59585, 0.98212), abs=1e-5)
+    assert success_estimate(0, 4)[:3] == pytest.approx((0.0, 0.0, 0.48990), abs=1e-5)
+    assert mean_estimate([1.0, 2.0, 3.0])[:3] == pytest.approx((2.0, -0.48414, 4.48414), abs=1e-5)
 
 
 def test_without_a_terminal_progress_is_a_line(capsys):
