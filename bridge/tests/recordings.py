@@ -94,6 +94,11 @@ def rerun(*arguments: str) -> str:
     return subprocess.run(command, check=True, capture_output=True, timeout=60, text=True).stdout
 
 
+def verify_view(recording: Path) -> str:
+    rerun("rrd", "verify", str(recording))
+    return rerun("rrd", "stats", str(recording))
+
+
 def chunks(path: Path) -> list[ChunkIndex]:
     with path.open("rb") as stream:
         summary = make_reader(stream).get_summary()

@@ -42,7 +42,7 @@ from bridge.recording import (
     whole_recording,
 )
 from bridge.replay import RecordedDrive, replay
-from bridge.tests.recordings import chunks, flip, health, heard, start_record
+from bridge.tests.recordings import chunks, flip, health, heard, start_record, verify_view
 from edge_runtime.cli import quit_on_signals
 from edge_runtime.config import Config
 from edge_runtime.manifest import Entry, Task
@@ -162,6 +162,13 @@ def test_everything_on_the_wire_is_recorded_and_mcap_reads_it(drive):
     for topic, least in {"command": steps, "health": 1, "alive": 1, "simulator": 2}.items():
         assert counts[f"phil/hunter01/{topic}"] >= least
     assert [state.step for _, state in states_in(recording)] == list(range(steps + 1))
+
+
+def test_a_view_keeps_what_it_recorded_and_ends_with_the_simulator(drive):
+    found = verify_view(drive[1])
+    entities = ("frames/now", "road/ego/body", "action/asked", "latency/round_trip", "mode/mode")
+    assert [one for one in entities if one not in found] == []
+    assert list(drive[1].parent.glob(".drive*")) == []
 
 
 COPIED = (State, Command, Health, Scene, RawImage, Log, SceneUpdate, FrameTransform)

@@ -217,18 +217,6 @@ def test_what_the_trainer_takes_loads_neither_zenoh_nor_rerun():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def verify(recording):
-    recordings.rerun("rrd", "verify", str(recording))
-    return recordings.rerun("rrd", "stats", str(recording))
-
-
-def test_a_view_keeps_what_it_recorded_and_ends_with_the_simulator(drive):
-    found = verify(drive[1])
-    entities = ("frames/now", "road/ego/body", "action/asked", "latency/round_trip", "mode/mode")
-    assert [one for one in entities if one not in found] == []
-    assert list(drive[1].parent.glob(".drive*")) == []
-
-
 def test_a_view_that_is_interrupted_keeps_what_it_recorded(tmp_path):
     endpoint, recording = free_endpoint(), tmp_path / "drive.rrd"
     words = ("view", "--save", str(recording), "--connect", endpoint)
@@ -238,7 +226,7 @@ def test_a_view_that_is_interrupted_keeps_what_it_recorded(tmp_path):
         assert not recording.exists()
         view.send(signal.SIGTERM)
         assert view.wait(20) == 0, view.errors
-    verify(recording)
+    recordings.verify_view(recording)
     assert list(tmp_path.iterdir()) == [recording]
 
 
@@ -270,7 +258,7 @@ def test_a_recording_is_shown_without_a_drive_and_without_what_is_broken(tmp_pat
     shutil.copy(drives.LEFT_TURN, path)
     recordings.flip_chunk(path, 3)
     assert main(["view", str(path), "--save", str(out)]) == 0
-    found, said = verify(out), capsys.readouterr()
+    found, said = recordings.verify_view(out), capsys.readouterr()
     entities = ("frames/now", "road/ego/body", "road/roads", "action/asked", "latency/inference",
                 "mode/reason", "rejected/edge")  # fmt: skip
     assert [entity for entity in entities if entity not in found] == []
@@ -299,7 +287,7 @@ def test_no_number_ends_a_viewer_or_makes_a_recording_unviewable(tmp_path, capsy
             payload = msgspec.msgpack.encode(message)
             writer.write(messages.Heard(f"phil/v/{topic}", topic, payload, at_ns, len(payload)))
     assert main(["view", str(path), "--save", str(out)]) == 0
-    assert "latency/round_trip" in verify(out)
+    assert "latency/round_trip" in recordings.verify_view(out)
     (line,) = capsys.readouterr().err.splitlines()
     (left_out,) = map(int, re.findall(r"left out: (\d+) messages", line))
     assert len(absurd) / 2 < left_out < len(absurd)
