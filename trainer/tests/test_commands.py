@@ -1,7 +1,7 @@
 import json
 import shlex
 import shutil
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -10,6 +10,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from hil_tests.tests.shared.commands import call, refusal
 from hil_tests.tests.shared.policies import public_pem
+from trainer.scenarios.left_turn import SCENES
 from trainer.tests.odd import odd
 from trainer.training.command import FINDS_NOTHING
 from trainer.training.config import RunConfig
@@ -58,7 +59,7 @@ def test_bad_input_gets_one_line_and_status_2(words, said, capsys, tmp_path, mon
 
 @pytest.mark.parametrize("episodes", [1, 2])
 def test_only_several_episodes_of_one_return_say_that_nothing_pays(capsys, tmp_path, episodes):
-    words = ("--scenario", odd("Flat"), "--algorithm", "per_td3")
+    words = ("--scenario", odd("Flat"), "--algorithm", "per_td3", "--set", "evaluation_runs=1")
     status, _, err = call(capsys, "train", *words, "--out", tmp_path, "--episodes", episodes)
     assert status == 0
     assert (FINDS_NOTHING in err) == (episodes > 1)
@@ -98,23 +99,24 @@ def test_a_shipped_policy_is_verified_with_the_key_beside_it(capsys, tmp_path, m
 def test_the_whole_way_from_human_to_policy_file(capsys, tmp_path, monkeypatch):
     """Every command once, as the README has them, on the smallest of runs."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(SCENES, "nominal", replace(SCENES["nominal"], max_steps=30))
     human = "human --out human --episodes 1 --updates-per-episode 2 --refining-updates 3"
     train = "train --human human --out run --episodes"
     small = "--set batch_size=4 --set evaluation_runs=1"
     for words in (
-        human, f"{train} 2 {small}", f"{train} 3 {small} --resume",
-        "train --resume --out run", "train --resume --episodes 4 --out run",
+        human, f"{train} 2 {small}", "train --resume --episodes 3 --out run",
+        "train --resume --out run",
         "export run --out policy.onnx",
         "evaluate policy.onnx --runs 1", f"evaluate {CONGESTION} --runs 1",
         "evaluate run --runs 1", "evaluate human --runs 1", "plot run",
     ):  # fmt: skip
         status, _, err = call(capsys, *words.split())
         assert status == 0, err
-    assert len(read_metrics(Path("run"))) == 4
+    assert len(read_metrics(Path("run"))) == 3
     for words, said in (
         (f"{train} 2", "--resume"),
-        (f"{train} 2 {small} --resume", "was trained with episodes = 4, not 2"),
-        (f"{train} 4 --seed 8 --resume", "was trained with seed = 0, not 8"),
+        (f"{train} 2 {small} --resume", "was trained with episodes = 3, not 2"),
+        (f"{train} 3 --seed 8 --resume", "was trained with seed = 0, not 8"),
         (human, "holds a human model"),
     ):
         assert said in refusal(capsys, *words.split())
