@@ -46,7 +46,7 @@ def settled(outcomes: Iterable[str]) -> list[str]:
     return [TIMEOUT if told and each == TRUNCATED else each for each in outcomes]
 
 
-UPPER = 0.975  # Quantile at the upper end of an interval
+UPPER = 0.975  # Quantile at the upper end of a 95 % interval
 
 
 class Estimate(NamedTuple):
