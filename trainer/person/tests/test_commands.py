@@ -3,6 +3,7 @@ import signal
 from concurrent.futures import ProcessPoolExecutor, wait
 from itertools import repeat
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -99,8 +100,8 @@ class UntilChecked(Puppet):
 class Prompt(ProcessPoolExecutor):
     """Has answered before the next step: all that is trained meanwhile takes a processor."""
 
-    def submit(self, *work):
-        future = super().submit(*work)
+    def submit(self, *work: Any, **more: Any) -> Any:
+        future = super().submit(*work, **more)
         wait([future])
         return future
 
