@@ -9,12 +9,12 @@ from edge_runtime.cli import program, run_cli
 
 COMMANDS = {
     "simulate": ("bridge.simulate", "serve an environment to an edge runtime"),
-    "sense": ("bridge.ports:sense", "serve a robot's own senses, not a simulator's"),
+    "sense": ("bridge.ports:sense", "serve a robot's own sensors in place of a simulator"),
     "router": ("bridge.ports:router", "connect simulators, edge runtimes and viewers"),
     "record": ("bridge.ports:record", "write everything on the wire to an MCAP recording"),
     "replay": ("bridge.replay", "run recorded states through a policy, and compare"),
-    "shadow": ("bridge.shadow", "answer beside the policy that drives, and move nothing"),
-    "fork": ("bridge.fork", "rebuild a recorded drive, and drive on in another way"),
+    "shadow": ("bridge.shadow", "run a second policy beside the driving one, moving nothing"),
+    "fork": ("bridge.fork", "rebuild a recorded drive up to a moment, and drive on from there"),
     "export": ("bridge.lerobot", "turn a recording into a LeRobot data set"),
     "view": ("bridge.ports:view", "show the wire in rerun, live or in a file"),
 }
@@ -28,6 +28,6 @@ main = program(
 
 if __name__ == "__main__":
     status = run_cli(main)
-    if sys.argv[1:2] == ["sense"]:  # The interpreter's exit would wait for threads of a source.
+    if sys.argv[1:2] == ["sense"]:  # The interpreter's exit would wait for a source's threads.
         os._exit(status)
     sys.exit(status)

@@ -1,11 +1,11 @@
-"""The clocks: each carries one tick's state out and brings the vehicle's decision back.
+"""The clocks: each sends one tick's state and returns the vehicle's decision.
 
-In lock-step latency passes in virtual time (`VirtualLink`), and each real answer is awaited.
-Computing takes no virtual time, so one seed gives one run on a fast and a slow machine.
+In lock-step latency passes in virtual time (`VirtualLink`), and the clock waits for each answer.
+Computing takes no virtual time, so a seed gives the same run on a fast and a slow machine.
 
 Real time has absolute ticks on the monotonic clock and waits for no answer. The vehicle acts at the
 latest T / 4 after a tick on the newest command that has arrived. With a vehicle in the loop
-(`VehicleClock`), its newest feedback at tick n + 1 says what came of state n.
+(`VehicleClock`), its newest feedback at tick n + 1 shows the effect of state n.
 """
 
 from __future__ import annotations
@@ -48,29 +48,29 @@ class _Clock:
     latencies_ms: list[float] = field(default_factory=list)
     """From state sent to command received, injected delays included; one per answered state."""
     missed_ticks: int = 0
-    """Whole ticks of the wall clock that went by without a state because the machine was late."""
+    """Whole ticks of the wall clock that passed without a state because the machine was late."""
     wall_clock_stalls: int = 0
     """States of lock-step that the edge runtime answered too late in wall time, not at all, or with
-    a stop for that: it was gone or starved. Always 0 in real time."""
+    a stop for lateness: it was gone or starved. Always 0 in real time."""
 
     def __post_init__(self) -> None:
         self._period_s = self.task.control_period_s
         self._silence_s = inbound.BRAKE_PERIODS * self._period_s
         self._hold = inbound.CommandHold(0.0, self._period_s)
-        # Real time's delay line and ticks share what this guards; lock-step has one thread.
+        # In real time, guards what the delay line and the ticks share; lock-step has one thread.
         self._arrived = threading.Condition()
 
     def rejected(self) -> Counter[str]:
         return Counter(dict(self.check.rejected))  # Another thread may go on counting
 
     def newest_answer(self) -> tuple[int, float] | None:
-        """Return the newest state of this episode that was answered, and its latency in ms."""
+        """Return the newest answered step of this episode, and its latency in ms."""
         with self._arrived:
             step = self._hold.newest_step
             return None if step < 0 else (step, self.latencies_ms[-1])
 
     def finish(self, state: State) -> None:
-        """Send the final state past the injected network, and forget whatever is under way."""
+        """Send the final state past the injected network, and drop messages under way."""
         with self._arrived:
             self.check.end(state.step)
         self.publish(self._stamped(state))
@@ -84,7 +84,7 @@ class _Clock:
 
 
 class LockStepClock(_Clock):
-    """One thread runs it; Zenoh's only fills the inbox."""
+    """Runs in one thread; Zenoh's thread only fills the inbox."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -116,21 +116,21 @@ class LockStepClock(_Clock):
     def _arrive_at_edge(self, arrival: network.Arrival[State]) -> None:
         # The stamp is the wall clock at the real publication: virtual delays are not in it.
         payload = self._stamped(arrival.message)
-        # What came between two ticks is read all the same, so that faults are counted.
+        # Commands that came between two ticks are read, too, so that faults are counted.
         while not self._inbox.empty():
             self.check.read(self._inbox.get(), time.time_ns())
         published_s = time.monotonic()
         self.publish(payload)
         if arrival.overtaken:
-            return  # The edge runtime rejects it as stale, as it should, and does not answer.
+            return  # The edge runtime rejects it as stale and does not answer.
         if (command := self._await_answer(arrival.step, published_s)) is not None:
             self._link.answer(arrival, command, computing_s=self._heard_s - published_s)
 
     def _await_answer(self, step: int, published_s: float) -> Command | None:
         """Wait in wall time for the answer to exactly this state.
 
-        At most until 2 T after the last answer, and T after this state at least. Once the edge
-        runtime is silent, T for each state is also the pace of the braking steps.
+        Waits until 2 T after the last answer, but for T at least. Once the edge runtime is silent,
+        the wait of T for each state also paces the braking steps.
         """
         self._heard_s = self._heard_s or published_s
         deadline_s = published_s + self._period_s
@@ -155,7 +155,7 @@ class LockStepClock(_Clock):
 
 
 class RealTimeClock(_Clock):
-    """The caller's thread runs the ticks, Zenoh's hands in commands, a delay line delivers both."""
+    """The caller's thread runs the ticks, Zenoh's takes commands, a delay line delivers both."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -202,7 +202,7 @@ class RealTimeClock(_Clock):
         return tick_s
 
     def _send(self, direction: network.LatencyModel, payload: bytes, deliver: Publish) -> None:
-        # The model's time is the episode's, so that its outages come as in lock-step.
+        # The model's time starts with the episode, so that its outages come as in lock-step.
         sent_s = time.monotonic() - self._begun_s
         for arrival_s in direction.arrivals(sent_s, len(payload)):
             self._line.push(self._begun_s + arrival_s, partial(deliver, payload))
@@ -236,37 +236,37 @@ class RealTimeClock(_Clock):
 
 
 class VehicleClock(RealTimeClock):
-    """The clock of ``--loop vehicle``; it keeps the vehicle's name and faults for the report."""
+    """The clock of ``--loop vehicle``; keeps the vehicle's name and faults for the report."""
 
     def __post_init__(self) -> None:
         self.vehicle = ""
-        self.faults: Counter[str] = Counter()  # By the feedback messages that held them
+        self.faults: Counter[str] = Counter()  # Feedback messages with each fault
         self.feedback_check = inbound.FeedbackCheck(self.check)
         super().__post_init__()
 
     def begin(self, episode: int, seed: int) -> None:
         super().begin(episode, seed)
         with self._arrived:
-            # Its own stream, so that commands meet the same luck as without it.
+            # A random stream of its own, so that commands meet the same delays as without it.
             self._feedback_way = network.make_network(self.spec, seed + 1).down
 
     def receive_feedback(self, payload: bytes) -> None:
         self._send(self._feedback_way, payload, self._feedback_arrives)
 
     def wait_for_vehicle(self, limit_s: float, start: str) -> None:
-        """Wait until the vehicle reports; UserError after ``limit_s``, with what starts one."""
+        """Wait until a vehicle reports; UserError after ``limit_s``, with the command ``start``."""
         if not self._wait_until(lambda _: True, limit_s):
             raise UserError(f"no vehicle reports after {limit_s:g} s; start one: {start}")
 
     def wait_for_standstill(self) -> None:
-        self._wait_until(lambda told: abs(told.speed_mps) < STANDSTILL_MPS, STANDSTILL_WAIT_S)
+        self._wait_until(lambda it: abs(it.speed_mps) < STANDSTILL_MPS, STANDSTILL_WAIT_S)
 
     def rejected(self) -> Counter[str]:
         feedback = dict(self.feedback_check.rejected).items()
         return super().rejected() + Counter({f"feedback_{name}": n for name, n in feedback})
 
     def exchange(self, state: State) -> Decision:
-        """Wait for the tick, send its state, and at the next tick say what the vehicle has done."""
+        """Wait for the tick, send its state, and return the vehicle's decision at the next tick."""
         end_s = self._send_state(state) + self._period_s
         time.sleep(max(0.0, end_s - time.monotonic()))
         with self._arrived:
@@ -295,7 +295,7 @@ class VehicleClock(RealTimeClock):
 class DelayLine:
     """Runs actions at their time (monotonic), on a thread that ``close`` ends.
 
-    What an action raises ends the line, and is raised by the next ``push`` or ``close``.
+    An action's exception ends the line, and is raised by the next ``push`` or ``close``.
     """
 
     def __init__(self) -> None:
@@ -328,7 +328,7 @@ class DelayLine:
             while not self._closed:
                 self._changed.wait(self._actions.run(blocking=False))
                 self._changed.clear()
-        except Exception as error:  # Handed to whoever uses the line.
+        except Exception as error:  # Raised by the next `push` or `close`
             self._failure = error
 
 

@@ -1,7 +1,7 @@
-"""Environments: found by name, described for a policy file, and adapted to a task.
+"""Make environments by name, describe them for a policy file, and adapt them to a task.
 
-The bridge knows them only by name. Everything beyond gymnasium's own interface is optional, and
-found by name on the environment or one of its wrappers (docs/own_environment.md).
+The bridge imports no environment itself. Everything beyond gymnasium's interface is optional, and
+looked up by name on the environment or one of its wrappers (docs/own_environment.md).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ Environment = gymnasium.Env[Any, Any]
 SCENARIO_GROUP = "phil.scenarios"
 NOMINAL = "nominal"
 CONDITIONS = {
-    NOMINAL: "the scene that is trained in",
+    NOMINAL: "the scene of the training",
     "variant": "more vehicles, and other types of them",
     "dense": "closer and less even traffic",
 }
@@ -65,32 +65,32 @@ def make_environment(name: str, condition: str = NOMINAL) -> Environment:
         _register(environment_id)
         options: dict[str, Any] = {} if condition == NOMINAL else {"scene": condition}
         try:
-            made = gymnasium.make(environment_id, render_mode=RENDERED, **options)
-        except Exception:  # Not every constructor takes it
-            made = gymnasium.make(environment_id, **options)
-        return _OneLine(made)
+            environment = gymnasium.make(environment_id, render_mode=RENDERED, **options)
+        except Exception:  # Not every constructor takes render_mode
+            environment = gymnasium.make(environment_id, **options)
+        return _OneLine(environment)
     except (Exception, SystemExit) as error:  # A module may raise anything when it is imported
         what = f"{type(error).__name__}: {error}".splitlines()[0]
         hint = f"use {', '.join(sorted(scenarios()))}, a gymnasium id, or module:id"
         raise UserError(f"no environment {name!r}: {what} ({hint})") from error
-    finally:  # Gymnasium's advice to its author would stand before our one line.
+    finally:  # Until here, because gymnasium's advice to authors would precede our one line
         gymnasium.logger.min_level = level
 
 
 class _OneLine(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Reports in one line what a foreign environment raises while it drives."""
+    """Turns an exception of a foreign environment into a UserError of one line."""
 
     def reset(self, **options: Any) -> Any:
         return self._do(self.env.reset, **options)
 
     def step(self, action: Any) -> Any:
-        return self._do(self.env.step, np.array(action))  # It may write into its copy
+        return self._do(self.env.step, np.array(action))  # A copy, into which it may write
 
     def render(self) -> Any:
         return self._do(self.env.render)
 
     def close(self) -> None:
-        with contextlib.suppress(Exception):  # A fault here must not cost what was driven
+        with contextlib.suppress(Exception):  # A fault here must not cost the drive's results
             self.env.close()
 
     def _do(self, call: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
@@ -110,7 +110,7 @@ def _register(environment_id: str) -> None:
     if ":" in environment_id or environment_id in gymnasium.registry:
         return
     for scenario in importlib.metadata.entry_points(group=SCENARIO_GROUP):
-        with contextlib.suppress(Exception):  # It may be of another package
+        with contextlib.suppress(Exception):  # Another package's scenario may fail to load
             scenario.load()
     for plugin in importlib.metadata.entry_points(group=PLUGIN_GROUP):
         register = plugin.load()
@@ -125,16 +125,16 @@ def describe(
 
     The period is ``period_s`` where given, else the environment's ``control_period_s``, that of
     ``config["policy_frequency"]`` (highway-env's), ``dt``, a guess from ``render_fps``, or
-    ``unknown_s``; a line tells of the last two. UserError where the wire cannot carry it.
+    ``unknown_s``; the last two print a line. UserError where the wire cannot carry the task.
     """
     name = offered(environment, "scenario") or name_of(environment)
     try:
         car = msgspec.convert(offered(environment, "car"), Car | None)
     except msgspec.ValidationError as error:
         raise UserError(f"environment {name!r}: its car is not valid: {error}") from None
-    seen, action = _entries(environment, name), _actions(environment, name)
+    entries, action = _entries(environment, name), _actions(environment, name)
     period_s = period_s or _period_s(environment, name, unknown_s)
-    task = Task(task=name, observation=seen, action=action, control_period_s=period_s, car=car)
+    task = Task(task=name, observation=entries, action=action, control_period_s=period_s, car=car)
     check_task(task)
     return task
 
@@ -154,7 +154,7 @@ def offered(environment: Environment, name: str, default: Any = None) -> Any:
 
 @cache
 def say_once(text: str) -> None:
-    """Print a line on stderr, once a process: many environments of one kind may be made."""
+    """Print a line on stderr once a process: a process may make many environments of a kind."""
     print(text, file=sys.stderr)
 
 
@@ -164,7 +164,7 @@ def _entries(environment: Environment, name: str) -> dict[str, Entry]:
     plain = str(offered(environment, "observation_name", PLAIN))
     entries = {}
     for entry, box in (space.spaces if isinstance(space, Dict) else {plain: space}).items():
-        if not entry or entry.isdigit() or entry == OUTPUT:  # An ONNX graph would rename it
+        if not entry or entry.isdigit() or entry == OUTPUT:  # The ONNX export would rename it
             taken = "an observation's name must not be empty, a number or the policy's output"
             raise UserError(f"environment {name!r} observes {entry!r}: {taken}")
         dtype = str(getattr(box, "dtype", None)).replace("float64", "float32")
@@ -210,10 +210,10 @@ def _period_s(environment: Environment, name: str, unknown_s: float | None) -> f
     own, config = (offered(environment, key) for key in ("control_period_s", "config"))
     if own is not None:
         return finite("control_period_s", own)
-    # Other environments use these names for other things, which are no positive number.
+    # Other environments may use these names for things that are no positive number.
     rate = _positive(config.get("policy_frequency")) if isinstance(config, Mapping) else None
-    if found := (rate and 1.0 / rate) or _positive(offered(environment, "dt")):
-        return found
+    if period_s := (rate and 1.0 / rate) or _positive(offered(environment, "dt")):
+        return period_s
     says = f"{name} does not say how long a step is"
     if frames_per_s := _positive(environment.metadata.get("render_fps")):
         say_once(f"{says}: {1.0 / frames_per_s:g} s is guessed from its render_fps")
@@ -230,7 +230,7 @@ def _positive(value: Any) -> float | None:
 
 
 def finite(name: str, value: Any) -> float:
-    """Return the number; UserError for one that no wire or report carries."""
+    """Return the value as a finite number; UserError for any other."""
     with contextlib.suppress(TypeError, ValueError):
         if math.isfinite(number := float(value)):
             return number
@@ -248,7 +248,7 @@ def draws(environment: Environment) -> bool:
 
 
 def picture_of(environment: Environment) -> bytes:
-    """Return a JPEG of what ``render()`` shows; empty for an environment that does not draw."""
+    """Return ``render()``'s picture as JPEG; empty for an environment that does not draw."""
     if not draws(environment):
         return b""
     shown = io.BytesIO()
@@ -257,9 +257,9 @@ def picture_of(environment: Environment) -> bytes:
 
 
 class Adapter:
-    """An environment that is driven as a task says.
+    """Converts a task's actions and observations for its environment.
 
-    Its own ``brake_action`` and ``press_brake`` come before the safe stops of the task's actions.
+    The environment's ``brake_action`` and ``press_brake`` outrank the task's safe stop values.
     """
 
     def __init__(self, env: Environment, task: Task) -> None:
@@ -302,14 +302,14 @@ def arrays_of(task: Task, observation: Any) -> dict[str, np.ndarray]:
 
 def _fitting(observation: Mapping[str, Any], name: str, entry: Entry) -> np.ndarray:
     try:
-        given = np.asarray(observation[name])
-        array = np.asarray(given, entry.dtype)
+        original = np.asarray(observation[name])
+        array = np.asarray(original, entry.dtype)
     except (LookupError, TypeError, ValueError) as error:
         raise UserError(f"the observation {name}: {type(error).__name__}: {error}") from None
     if array.shape != tuple(entry.shape):
         raise UserError(f"the observation {name} is {array.shape}, not {tuple(entry.shape)}")
-    # A float may come as any number; of whole numbers none may change.
-    if array.dtype.kind != "f" and not (given.dtype.kind in "iub" and np.array_equal(array, given)):
-        found = f"{given.ravel()[np.argmax(array != given)]} ({given.dtype})"
-        raise UserError(f"the observation {name} holds {found}; it is to be {array.dtype}")
+    is_whole = original.dtype.kind in "iub"  # A float may be rounded; these must not change
+    if array.dtype.kind != "f" and not (is_whole and np.array_equal(array, original)):
+        value = f"{original.ravel()[np.argmax(array != original)]} ({original.dtype})"
+        raise UserError(f"the observation {name} holds {value}; it must be {array.dtype}")
     return array

@@ -1,8 +1,7 @@
 """``python -m bridge fork``: rebuild a recorded drive up to a moment, and drive on in another way.
 
-The scene is rebuilt from its seed and all actions, and each observation compared, to the bit. From
-there it is an ordinary drive in lock-step, with a policy in this process. A person drives on in the
-trainer, whose command is run.
+The scene is rebuilt from its seed and all actions, and each observation compared, to the bit. Then
+follows a drive in lock-step with a policy in this process, or a person's ``trainer drive``.
 """
 
 from __future__ import annotations
@@ -51,7 +50,7 @@ EXAMPLE = cli.examples(
 
 @dataclass
 class RecordedEpisode:
-    """One episode of a recording, by step; ``number`` is its place among them, from 0."""
+    """One episode of a recording, by step; ``number`` counts the episodes from 0."""
 
     path: Path
     vehicle_id: str
@@ -63,14 +62,14 @@ class RecordedEpisode:
     commands: dict[int, Command] = field(default_factory=dict)  # First answer to each state
     applied: dict[int, tuple[list[float], bool]] = field(default_factory=dict)
     """Of each step: the action, and whether the brake was pressed."""
-    waited: int = 0  # Steps that do not count: the vehicle waited for a re-arm
+    waited: int = 0  # Steps before the drive, in which the vehicle waited for a re-arm
 
     @property
     def steps(self) -> int:
         return next(n for n in range(len(self.applied) + 1) if n not in self.applied)
 
     def step_at(self, at_s: float) -> int:
-        """Return the first step from that time on; UserError where it is not recorded."""
+        """Return the first step at or after a time; UserError where it is not recorded."""
         period_s = self.task.control_period_s
         step = math.ceil(at_s / period_s - 1e-6)
         if step >= self.steps:
@@ -79,33 +78,33 @@ class RecordedEpisode:
         return step
 
     def environment(self, named: str | None = None, option: str = "--env") -> Environment:
-        """Make the environment, or the one ``named`` by the option that a person typed.
+        """Make the recorded environment, or the one ``named`` by a person's ``option``.
 
         UserError where there is none, or where its task has changed.
         """
         name = named or name_in_file(self.origin.environment, f"{self.path} was driven in", option)
-        made = make_environment(name, self.origin.condition)
-        if (now := describe(made, self.task.control_period_s).text) != self.task.text:
+        environment = make_environment(name, self.origin.condition)
+        if (now := describe(environment, self.task.control_period_s).text) != self.task.text:
             raise UserError(f"{self.path} was driven in {self.task.text!r}, and {name} is {now!r}")
-        return made
+        return environment
 
 
 def read_episodes(
     path: Path, vehicle_id: str | None = None, number: int | None = None
 ) -> list[RecordedEpisode]:
-    """Read all episodes, with the messages of all, or of that ``number`` only."""
+    """Read all episodes; without ``number`` with all messages, else with those of this one only."""
     recording = Recording(path)
     vehicle_id = choose_vehicle(recording, vehicle_id)
     drives: dict[tuple[str, int], RecordedEpisode] = {}
     for heard, message in valid_messages(recording, vehicle_id):
         if isinstance(message, Scene) and message.origin is not None and message.task is not None:
             about = message.origin, message.task, heard.arrived_ns
-            begun = RecordedEpisode(path, vehicle_id, len(drives), *about)
-            begun = drives.setdefault((message.origin.session, message.episode), begun)
-            begun.waited = message.waited
-            if len(message.applied or ()) == len(begun.task.action):
+            episode = RecordedEpisode(path, vehicle_id, len(drives), *about)
+            episode = drives.setdefault((message.origin.session, message.episode), episode)
+            episode.waited = message.waited
+            if len(message.applied or ()) == len(episode.task.action):
                 step = message.step - message.waited - 1
-                begun.applied[step] = list(message.applied or ()), message.braked
+                episode.applied[step] = list(message.applied or ()), message.braked
         elif isinstance(message, State | Command):
             drive = drives.get((message.session, message.episode))
             if drive is not None and number in (None, drive.number):
@@ -117,7 +116,7 @@ def read_episodes(
 
 
 class ForkedEnvironment(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """An environment whose every episode begins where a recorded drive is forked."""
+    """An environment whose episodes all begin at the fork of a recorded drive."""
 
     def __init__(self, environment: Any, drive: RecordedEpisode, step: int) -> None:
         super().__init__(environment)
@@ -127,22 +126,22 @@ class ForkedEnvironment(gymnasium.Wrapper[Any, Any, Any, Any]):
         return getattr(self.env, name)
 
     def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
-        """Rebuild the drive; UserError where an observation is another than the recorded one."""
+        """Rebuild the drive; UserError where an observation differs from the recorded one."""
         drive, adapter = self._drive, Adapter(self.env, self._drive.task)
         options = {"standing": True} if drive.origin.standing else None
-        seen, info = self.env.reset(seed=drive.origin.seed, options=options)
+        observation, info = self.env.reset(seed=drive.origin.seed, options=options)
         for step in range(self._fork + 1):
-            known = drive.states.get(step)
-            if known is not None and known.observation != adapter.pack(seen):
+            recorded = drive.states.get(step)
+            if recorded is not None and recorded.observation != adapter.pack(observation):
                 at = f"at step {step} ({step * drive.task.control_period_s:g} s)"
-                why = f"{at} the observation is another than recorded"
+                why = f"{at} the observation differs from the recorded one"
                 raise UserError(f"{drive.path}: the drive cannot be rebuilt: {why}")
             if step < self._fork:
                 action, braked = drive.applied[step]
                 adapter.press_brake(braked)
-                seen, *_, info = self.env.step(adapter.within(action))
+                observation, *_, info = self.env.step(adapter.within(action))
         adapter.press_brake(False)
-        return seen, info
+        return observation, info
 
 
 class ForkedDrive(LockStepClock):
@@ -180,7 +179,7 @@ class ForkedDrive(LockStepClock):
         return runner.run(0, origin.seed)
 
     def _answer(self, payload: bytes) -> None:
-        """Answer a state as an edge runtime would to which no state comes late."""
+        """Answer a state as an edge runtime that receives no state late."""
         state = decode_state(payload)
         assert isinstance(state, State)
         if state.step <= self._newest:
@@ -215,14 +214,14 @@ def add_place(parser: Any) -> None:
     add_options(parser, "--vehicle-id", default=None, help=several)
 
 
-def find_fork(recording: str, asked: Namespace) -> tuple[RecordedEpisode, int]:
+def find_fork(recording: str, arguments: Namespace) -> tuple[RecordedEpisode, int]:
     """Return the drive that the options name, or the only one, and the step of the fork."""
-    drives = read_episodes(Path(recording), asked.vehicle_id, asked.episode)
-    number = 0 if asked.episode is None and len(drives) == 1 else asked.episode
+    drives = read_episodes(Path(recording), arguments.vehicle_id, arguments.episode)
+    number = 0 if arguments.episode is None and len(drives) == 1 else arguments.episode
     if number is None or number >= len(drives):
         which = f"{counted(len(drives), 'drive')} with scenes; --episode says which, from 0"
         raise UserError(f"{recording} holds {which}")
-    return drives[number], drives[number].step_at(asked.at)
+    return drives[number], drives[number].step_at(arguments.at)
 
 
 def add_arguments(parser: Any) -> None:
@@ -240,44 +239,45 @@ def add_arguments(parser: Any) -> None:
     add_options(parser, "--out")
 
 
-def run(asked: Namespace) -> int:
-    if asked.human is not None:
-        _hand_over(asked)
-    drive, fork = find_fork(asked.recording, asked)
-    at_s, found, policy = fork * drive.task.control_period_s, None, None
-    if asked.policy is not None:
-        policy = load_policy(asked.policy, asked.public_key, asked.allow_unsigned)
-    with closing(drive.environment(asked.env)) as environment:
+def run(arguments: Namespace) -> int:
+    if arguments.human is not None:
+        _hand_over(arguments)
+    drive, fork = find_fork(arguments.recording, arguments)
+    at_s, result, policy = fork * drive.task.control_period_s, None, None
+    if arguments.policy is not None:
+        policy = load_policy(arguments.policy, arguments.public_key, arguments.allow_unsigned)
+    with closing(drive.environment(arguments.env)) as environment:
         if policy is None:
             ForkedEnvironment(environment, drive, drive.steps).reset()
         else:
-            with whole_recording(asked.record) if asked.record else nullcontext() as out:
-                found = ForkedDrive(drive, environment, fork, policy, asked.latency, out).run()
+            with whole_recording(arguments.record) if arguments.record else nullcontext() as out:
+                result = ForkedDrive(drive, environment, fork, policy, arguments.latency, out).run()
     report = {
-        "recording": asked.recording,
+        "recording": arguments.recording,
         "episode": drive.number,
         "origin": msgspec.structs.asdict(drive.origin),
         "at_s": round(at_s, 6),
-        "latency_spec": str(asked.latency or drive.origin.latency),
+        "latency_spec": str(arguments.latency or drive.origin.latency),
         "policy_id": policy.policy_id if policy else "",
         "recorded_policy_ids": sorted({each.policy_id for each in drive.commands.values()}),
-        "fork": found and asdict(found),
+        "fork": result and asdict(result),
     }
-    write_json_out(asked.out, report)
-    end = f"forked at {at_s:g} s: {found.outcome} {found.time_s:g} s later" if found else ""
+    write_json_out(arguments.out, report)
+    end = f"forked at {at_s:g} s: {result.outcome} {result.time_s:g} s later" if result else ""
     print(printable(end or "rebuilt to its end, to the bit"))
     return 0
 
 
-def _hand_over(asked: Namespace) -> None:
-    """Let the trainer's command take this process's place: it has the screen and the signals."""
-    if asked.latency is not None or asked.out is not None:
+def _hand_over(arguments: Namespace) -> None:
+    """Replace this process by the trainer's command, which gets the terminal and the signals."""
+    if arguments.latency is not None or arguments.out is not None:
         raise UserError("--human takes no --latency and no --out: it drives without a network")
-    given = {
-        "--at": asked.at, "--human": asked.human, "--episode": asked.episode,
-        "--vehicle-id": asked.vehicle_id, "--scenario": asked.env, "--out": asked.record,
-        "--policy": asked.policy, "--public-key": asked.public_key,
+    options = {
+        "--at": arguments.at, "--human": arguments.human, "--episode": arguments.episode,
+        "--vehicle-id": arguments.vehicle_id, "--scenario": arguments.env,
+        "--out": arguments.record, "--policy": arguments.policy,
+        "--public-key": arguments.public_key,
     }  # fmt: skip
-    words = [str(word) for pair in given.items() if pair[1] is not None for word in pair]
-    command = [sys.executable, "-m", "trainer", "drive", "--from", asked.recording, *words]
+    words = [str(word) for pair in options.items() if pair[1] is not None for word in pair]
+    command = [sys.executable, "-m", "trainer", "drive", "--from", arguments.recording, *words]
     os.execv(sys.executable, command)

@@ -1,6 +1,6 @@
-"""The vehicle's side of the safety rules: what the simulator believes, holds and brakes for. Pure.
+"""The vehicle's side of the safety rules: which messages count, and when it brakes. Pure.
 
-`CommandCheck` and `FeedbackCheck` count by reason what is not believed. `CommandHold` holds the
+`CommandCheck` and `FeedbackCheck` reject messages and count them by reason. `CommandHold` holds the
 newest command from tick to tick, and brakes 2 T after it, or where it says ``safe_stop``.
 """
 
@@ -16,19 +16,19 @@ from edge_runtime import wire
 from edge_runtime.manifest import Action, Task
 from edge_runtime.wire import DRIVE, SAFE_STOP, Command, Feedback, Reason, Rejection
 
-BRAKE_PERIODS = 2  # So many T without a command, and the vehicle brakes by itself
+BRAKE_PERIODS = 2  # After so many T without a command the vehicle brakes by itself
 ROUNDING_S = 1e-9
 """Sums such as 0.3 + 0.01 + 0.015 miss 0.325 by less than this; no real delay is as short."""
 NO_COMMAND = "no_command"  # Brake reason: the vehicle brakes by itself after 2 T of silence
 UNKNOWN_SAFE_STOP = "safe_stop"  # Brake reason when a safe_stop command gives none of its own
 NO_FEEDBACK = "no_feedback"
-"""Brake reason: nothing was heard from the vehicle for 2 T, so the car brakes in its place."""
+"""Brake reason: the vehicle sent no feedback for 2 T, so the simulated car brakes."""
 SELF_BRAKING = "self_braking"  # Brake reason: the vehicle says that it brakes by itself
-UNKNOWN_STEP = "unknown_step"  # It answers a state never sent
+UNKNOWN_STEP = "unknown_step"  # The message answers a state that was never sent
 NOT_COMMANDED = ""
 """Session of a vehicle that has not taken a command since its edge runtime was started."""
 COMMAND_ROUNDING, FEEDBACK_ROUNDING = 1e-6, 5e-4
-"""Of an action's whole range: a policy clamps to the last bit, an actuator is measured."""
+"""Share of an action's range: a policy clamps to the last bit, an actuator is measured."""
 
 
 @dataclass(frozen=True)
@@ -37,9 +37,9 @@ class Decision:
     fresh: bool  # It arrived since the decision before this one
     brake_reason: str  # Why the vehicle brakes; empty while it obeys the command
     ridden: int = 0
-    """Which action of its plan ``command`` has in the place of its own; 0: its own."""
+    """Number, from 1, of the plan's action that ``command`` now has; 0: its own action."""
     feedback: Feedback | None = None
-    """The vehicle in the loop about the tick; None without a vehicle, or where it is silent."""
+    """The report of a vehicle in the loop; None without a vehicle, or while it is silent."""
 
 
 class CommandHold:
@@ -66,7 +66,7 @@ class CommandHold:
         return True
 
     def decide(self, now_s: float, edge_silent: bool = False) -> Decision:
-        """Decide this tick; ``edge_silent``: lock-step has waited in vain, in wall time."""
+        """Decide this tick; ``edge_silent``: lock-step got no answer in wall time."""
         brake_reason, command, ridden = "", self.newest, 0
         plan = command.plan or [] if command is not None and command.mode == DRIVE else []
         silent_s = now_s - self._heard_s
@@ -84,7 +84,7 @@ class CommandHold:
 
 
 class CommandCheck:
-    """Reads the commands of one session, under the clock's lock; counts are of the whole run.
+    """Reads the commands of one session, under the clock's lock; counts over the whole run.
 
     ``policy_ids`` holds the policies that answered, each once, in order of appearance.
     """
@@ -147,7 +147,7 @@ class CommandCheck:
             if fault := _action_fault(action, self.actions):
                 return fault
         if len(plan) * self.period_s > wire.MAX_RIDE_S + ROUNDING_S:
-            return "plan_too_long"  # It would keep the vehicle going for longer than any may
+            return "plan_too_long"  # It lasts longer than MAX_RIDE_S
         if (command.episode, command.step) > self.newest:
             return UNKNOWN_STEP
         return ""
@@ -161,24 +161,24 @@ def _action_fault(
     for value, row in zip(values, actions, strict=True):
         slack = rounding * (row.high - row.low)
         if not row.low - slack <= value <= row.high + slack:
-            return "action_range"  # Where no policy and no actuator is
+            return "action_range"
     return ""
 
 
 class FeedbackCheck:
-    """Reads feedback for the session of ``commands`` and keeps the counts of the whole run.
+    """Reads feedback for the session of ``commands``; counts over the whole run.
 
-    Another simulator's session is no fault until the vehicle has heard of this session. Feedback is
-    in the order of its stamps; after 2 T of silence any stamp is taken, as of another board.
+    Feedback of another session is no fault until the vehicle has taken a command of this one. Older
+    stamps are stale; after 2 T of silence any stamp is accepted, because the board may be another.
     """
 
     def __init__(self, commands: CommandCheck) -> None:
         self.rejected: Counter[str] = Counter()
         self.heard: Feedback | None = None
-        """The last readable feedback, of whatever session: a vehicle is there."""
+        """The last readable feedback, of any session: it shows that a vehicle is there."""
         self.heard_s = 0.0
         self._commands, self._silence_s = commands, BRAKE_PERIODS * commands.period_s
-        self._met = False  # The vehicle has heard of this session.
+        self._met = False  # The vehicle has taken a command of this session.
         self._newest: Feedback | None = None
         self._newest_s = 0.0
 
@@ -198,26 +198,26 @@ class FeedbackCheck:
         self._newest, self._newest_s = feedback, now_s
         return feedback
 
-    def decide(self, heard: Decision, episode: int, now_s: float) -> Decision:
-        """Return what the vehicle did in the tick that ends now.
+    def decide(self, by_commands: Decision, episode: int, now_s: float) -> Decision:
+        """Decide by feedback for the tick that ends now.
 
-        ``heard`` is the decision by its commands, which the simulator hears, too. They only give a
-        stop its reason.
+        ``by_commands`` is the decision by the vehicle's commands, which the simulator receives,
+        too. It only gives a stop its reason.
         """
         silent = now_s - self._newest_s > self._silence_s + ROUNDING_S
         feedback, reason = None if silent else self._newest, ""
         if feedback is None:
             reason = NO_FEEDBACK
         elif feedback.episode != episode:
-            # Until it has taken a command of this episode it stands because the last one has
-            # ended: no fault, unless there are no commands.
-            reason = heard.brake_reason
+            # Until the vehicle has taken a command of this episode, it stands because the last
+            # one has ended: no fault, unless there are no commands.
+            reason = by_commands.brake_reason
         elif feedback.mode == SAFE_STOP:
-            reason = heard.brake_reason or UNKNOWN_SAFE_STOP
+            reason = by_commands.brake_reason or UNKNOWN_SAFE_STOP
         elif feedback.self_braking:
             reason = SELF_BRAKING
-        ridden = 0 if reason else heard.ridden
-        return replace(heard, brake_reason=reason, ridden=ridden, feedback=feedback)
+        ridden = 0 if reason else by_commands.ridden
+        return replace(by_commands, brake_reason=reason, ridden=ridden, feedback=feedback)
 
     def _fault(self, feedback: Feedback, now_s: float) -> str:
         if fault := _action_fault(feedback.action, self._commands.actions, FEEDBACK_ROUNDING):

@@ -1,7 +1,7 @@
 """``python -m bridge export``: turn a recording into a LeRobotDataset v3.0, in Parquet and MP4.
 
-A frame is an answered state with the first new answer to it; where nobody answered, the feature
-``step`` jumps. The file is read once for each array, so that pictures need no memory.
+A frame is a state with the first answer to it; a state without an answer is left out, and the
+feature ``step`` jumps. The file is read once for each array, so that pictures need no memory.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 FIRST = FILE.format(chunk_index=0, file_index=0)
 SAMPLED_PIXELS = 256  # Of each picture, for the statistics
 ENCODER = {"crf": "10", "g": "2", "bf": "0"}
-"""Hardly any loss; every second picture stands alone: a training jumps about in the video."""
+"""Nearly lossless; every second picture is a key frame, because a training seeks at random."""
 QUANTILES = (1, 10, 50, 90, 99)
 Columns = dict[str, Any]  # Feature to [frames, ...]; of a video, a sample of its pixels
 
@@ -81,7 +81,7 @@ def _export(drive: RecordedDrive, folder: Path) -> int:
     """Write the data set and return its number of frames; UserError where no state was answered."""
     task = drive.task
     if task is None:
-        raise UserError(f"{drive.recording.path} holds no scene that says how to read the states")
+        raise UserError(f"{drive.recording.path} holds no scene with a task to read the states by")
     for name in task.observation:
         if not re.fullmatch(r"[\w -]{1,64}", name):  # It becomes part of a path.
             raise UserError(f"the observation {name!r} cannot be the name of a feature")
@@ -126,7 +126,7 @@ def _kept(drive: RecordedDrive, task: Task) -> Iterator[tuple[Layout, State, Com
 
 
 def _numbers(drive: RecordedDrive, task: Task, rate: Fraction) -> tuple[Columns, list[int]]:
-    """Return the features of every data set, and where its episodes begin and the last ends."""
+    """Return the columns of every data set, and the bounds of its episodes in frames."""
     kept = [answer for _, _, answer in _kept(drive, task)]
     if not kept:
         raise UserError(f"{drive.recording.path} holds no answered state of {task.text}")
@@ -182,7 +182,7 @@ def _encode(
 def film(
     path: Path, rate: Fraction, options: dict[str, str] | None = None
 ) -> Iterator[Callable[[np.ndarray], None]]:
-    """Write an MP4 of ``rate`` pictures a second; yield what adds one, uint8 [height, width, 3]."""
+    """Write an MP4 of ``rate`` pictures a second; yield ``add(uint8 [height, width, 3])``."""
     with av.open(str(path), "w") as container:
         stream: Any = container.add_stream("libx264", rate=rate, options=options)
         numbers = count()
@@ -200,14 +200,14 @@ def film(
 
 
 def _pixel_format(picture: np.ndarray) -> str:
-    """Return colours of half the size, as players like them; they need even sizes."""
+    """Return the format with halved colours, which players expect and which needs even sizes."""
     return "yuv444p" if np.any(np.mod(picture.shape[:2], 2)) else "yuv420p"
 
 
 def _write_tables(
     folder: Path, task: str, rate: Fraction, columns: Columns, features: Any, bounds: list[int]
 ) -> None:
-    import pandas as pd  # Slow to load; a help does without it.
+    import pandas as pd  # Slow to load, and not needed for --help
 
     episodes = []
     places = [f"videos/{key}" for key in features if features[key]["dtype"] == "video"]
@@ -240,8 +240,8 @@ def _column(values: np.ndarray) -> Any:
 
 
 def _stats(columns: Columns, features: dict[str, Any], frames: slice) -> dict[str, Any]:
-    """Return LeRobot's statistics of each feature but texts; of a video each colour, 0 to 1."""
-    found = {}
+    """Return LeRobot's statistics of each feature except texts; of a video by colour, 0 to 1."""
+    all_stats = {}
     for key, feature in features.items():
         if feature["dtype"] == "string":
             continue
@@ -251,6 +251,6 @@ def _stats(columns: Columns, features: dict[str, Any], frames: slice) -> dict[st
             values, shape = values.reshape(-1, 3) / 255, [3, 1, 1]
         stats = {name: getattr(values, name)(0) for name in ("min", "max", "mean", "std")}
         stats |= {f"q{part:02d}": np.percentile(values, part, axis=0) for part in QUANTILES}
-        found[key] = {name: np.reshape(value, shape).tolist() for name, value in stats.items()}
-        found[key]["count"] = [frames.stop - frames.start]
-    return found
+        all_stats[key] = {name: np.reshape(value, shape).tolist() for name, value in stats.items()}
+        all_stats[key]["count"] = [frames.stop - frames.start]
+    return all_stats

@@ -1,6 +1,6 @@
 """The messages on the wire as listeners get them: the table of topics, and the scene.
 
-The scene is for viewers: the road from above, which the policy never hears of.
+The scene is for viewers: the road from above, which the policy never sees.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from edge_runtime.util import UserError
 MOST = 1e12  # Of metres, seconds, milliseconds and all else that is drawn
 MOST_STEPS = 10**8  # In an episode: 11 days at the shortest control period
 SHADOW = "shadow"
-"""Topic of what a policy in the shadow would have commanded: of recordings, never on the wire."""
+"""Topic of a shadow policy's commands: in recordings only, never on the wire."""
 TOKEN_TOPICS = ("alive", "simulator")
 """Liveliness tokens: of the edge runtime, and of the simulator (extension)."""
 
@@ -31,9 +31,9 @@ class Heard(NamedTuple):
 
     key: str
     topic: str
-    payload: bytes  # Of a token: 1 byte, 1 where it has come, 0 where it has gone
+    payload: bytes  # Of a token: 1 byte, 1 if it has appeared, 0 if it has gone
     arrived_ns: int
-    """This process's clock: the wall's at the start, then monotonic, so that it never goes back."""
+    """This process's clock: wall time at the start, then monotonic, so that it never goes back."""
     size: int  # Bytes on the wire; a payload over the contract's limit is not kept
 
     @property
@@ -65,7 +65,7 @@ class SeenCar(msgspec.Struct, frozen=True):
 
 
 def body(car: SeenCar) -> list[Point]:
-    """Return the line that fills the car when it is drawn as wide as it is (round ends)."""
+    """Return the line that fills the car when drawn with the car's width (round ends)."""
     reach = max(0.0, (car.length_m - car.width_m) / 2)
     return _line(car, -reach, reach)
 
@@ -75,7 +75,7 @@ def windscreen(car: SeenCar) -> list[Point]:
 
 
 def _line(car: SeenCar, *points: complex) -> list[Point]:
-    """Return points (m) that lie so far ahead of the car's centre, and aside (imaginary)."""
+    """Return points (m) from car coordinates: ahead of the centre (real) and aside (imaginary)."""
     placed = (complex(car.x, car.y) + cmath.rect(1.0, car.heading_rad) * each for each in points)
     return [(each.real, each.imag) for each in placed]
 
@@ -92,7 +92,7 @@ class SeenScene(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Origin(msgspec.Struct, frozen=True, kw_only=True):
-    """How an episode was begun: with ``Scene.applied``, all that ``bridge fork`` needs.
+    """How an episode began: with ``Scene.applied``, all that ``bridge fork`` needs.
 
     The fields are the options of ``bridge simulate``; ``seed`` is the episode's own.
     """
@@ -111,10 +111,10 @@ class Scene(SeenScene, frozen=True, kw_only=True):
     """The scene on the wire, with its place in time and the simulator's own facts.
 
     ``task`` says how to read the states. ``picture`` is a JPEG where there is no ``scene()``. The
-    step that led here had the action ``applied``, whoever decided it; ``braked``: with the brake
-    pressed; ``ridden``: its place in an earlier command's plan, 0 for none. ``waited`` counts the
-    first steps of the episode, in which the environment stood still: its vehicle waited for a
-    re-arm.
+    environment's last step had the action ``applied``, whoever decided it; ``braked``: with the
+    brake pressed; ``ridden``: its number in an earlier command's plan, 0 for none. ``waited``
+    counts the first steps of the episode, in which the environment stood still because its vehicle
+    waited for a re-arm.
     """
 
     episode: int
@@ -122,8 +122,8 @@ class Scene(SeenScene, frozen=True, kw_only=True):
     sim_time_s: float
     round_trip_ms: float | None = None
     """Of the newest command: from its state sent until it acts, injected delays included."""
-    answered_step: int | None = None  # The state, of this episode, that ``round_trip_ms`` is of
-    rejected: dict[str, int] = {}  # What the simulator did not believe so far, by reason
+    answered_step: int | None = None  # This episode's state that ``round_trip_ms`` belongs to
+    rejected: dict[str, int] = {}  # Messages that the simulator has rejected so far, by reason
     task: Task | None = None
     picture: bytes = b""
     origin: Origin | None = None
@@ -173,7 +173,7 @@ def decode_scene(payload: bytes) -> Scene | wire.Rejection:
     with contextlib.suppress(msgspec.MsgspecError, UnicodeDecodeError, RecursionError, UserError):
         scene = _DECODER.decode(payload)
         if scene.task is not None:
-            check_task(scene.task)  # Whoever sent it, a viewer reads states by it.
+            check_task(scene.task)  # A viewer reads states by it, whoever sent it.
         return scene
     return wire.Rejection(wire.Reason.MALFORMED, "not a scene")
 
@@ -222,7 +222,7 @@ class Pace:
         self._free_s = -math.inf  # When the next one is due
 
     def due(self, now_s: float) -> bool:
-        # One interval early will do, so that the jitter of a stream at the pace costs no message.
+        # A message may be one interval early, so that a stream with jitter loses none.
         if self._interval_s and now_s < self._free_s - self._interval_s:
             return False
         self._free_s = max(self._free_s, now_s) + self._interval_s

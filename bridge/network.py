@@ -1,8 +1,8 @@
-"""The simulated network: when a message between two ends arrives, drawn from a seed.
+"""The simulated network: arrival times of messages between two ends, drawn from a seed.
 
 Pure: the caller passes the time in. `LatencyModel` serves virtual time (`VirtualLink`, in lock-step
-and in training) and real time (timers). The way of a message (`LatencyModel`): queue and line,
-outage, loss, time under way, held back or not, duplicated or not, and in order if order is kept.
+and in training) and real time (timers). A message passes queue and line, outages, loss, delay,
+reordering, duplication and, if order is kept, waits for those before it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from edge_runtime.util import UserError
 from edge_runtime.wire import SAFE_STOP, Command
 
 DIRECTIONS = ("up", "down")  # State to edge runtime, and command to simulator
-COMMAND_WINDOW = 0.25  # Of T: a command that arrives so soon after the tick still acts in it
+COMMAND_WINDOW = 0.25  # Of T: a command that arrives this soon after a tick still acts in it
 STATE_BYTES, COMMAND_BYTES = 122, 217  # A state without its observation
 FREE, KEPT = ORDERS = ("free", "kept")
 NORMAL, PARETO = TAILS = ("normal", "pareto")
@@ -35,7 +35,7 @@ PARETO_ALPHA = 3.0  # As netem's pareto table: variance is finite above 2
 
 @dataclass(frozen=True)
 class Outage:
-    """A window in which nothing gets through, once or again and again; the episode begins at 0."""
+    """A window in which nothing gets through, once or periodic; the episode begins at 0."""
 
     length_s: float
     start_s: float  # When the (first) window begins
@@ -92,15 +92,15 @@ def _setting(default: Any, name: str, example: str, read: Callable[[str], Any]) 
 class DirectionSpec:
     """One direction of the network. UserError for impossible bursts."""
 
-    # Mean time under way
+    # Mean delay
     delay_ms: float = _setting(0.0, "delay", "50ms", _ms)
-    # Standard deviation of the time under way; what falls below zero becomes zero
+    # Standard deviation of the delay; a negative draw becomes zero
     jitter_ms: float = _setting(0.0, "jitter", "10ms", _ms)
     # Share of messages that never arrive, over good and bad stretches
     loss_percent: float = _setting(0.0, "loss", "1%", _percent)
-    # Distribution of the time under way (`SHAPES`); mean and standard deviation stay
+    # Distribution of the delay (`SHAPES`), with the same mean and standard deviation
     tail: str = _setting(NORMAL, "tail", PARETO, lambda word: TAILS[TAILS.index(word)])
-    # Mean length of a bad stretch, in which all is lost; 0: losses are independent
+    # Mean length of a bad stretch, in which every message is lost; 0: losses are independent
     burst_messages: float = _setting(0.0, "burst", "5", _messages)
     # Loss outside of bad stretches
     clear_loss_percent: float = _setting(0.0, "clear_loss", "0.1%", _percent)
@@ -109,7 +109,7 @@ class DirectionSpec:
     reorder_by_ms: float = _setting(150.0, "reorder_by", "300ms", _ms)
     # ``kept``: no message overtakes, so a late message holds up all behind it, as TCP does
     order: str = _setting(FREE, "order", KEPT, lambda word: ORDERS[ORDERS.index(word)])
-    # Share of messages that arrive twice; the copy's time under way is drawn anew
+    # Share of messages that arrive twice; the copy's delay is drawn anew
     duplicate_percent: float = _setting(0.0, "duplicate", "1%", _percent)
     # Bandwidth in 1000 bit/s; 0: no limit
     rate_kbps: float = _setting(0.0, "rate", "1Mbit/s", _kbps)
@@ -121,7 +121,7 @@ class DirectionSpec:
         if not self.burst_messages:
             return
         clear, loss = self.clear_loss_percent, self.loss_percent
-        # Good stretches last one message at least, so bad ones cannot fill more than this.
+        # Good stretches last one message at least, which limits the share of bad ones.
         most = self.burst_messages / (self.burst_messages + 1.0)
         if not (clear <= loss and clear < 100.0 and self.bad_share <= most):
             raise UserError(
@@ -131,7 +131,7 @@ class DirectionSpec:
 
     @property
     def bad_share(self) -> float:
-        """Share of messages in bad stretches that makes the overall loss the asked one."""
+        """Share of messages in bad stretches with which the overall loss is ``loss_percent``."""
         return (self.loss_percent - self.clear_loss_percent) / (100.0 - self.clear_loss_percent)
 
 
@@ -160,11 +160,11 @@ class LatencySpec:
 def parse_spec(text: str) -> LatencySpec:
     """Read a specification; raise UserError naming the part that is wrong.
 
-    Settings are separated by commas and hold each way; ``up.`` (state to edge) or ``down.``
-    (command to simulator) before one is for that way alone and outranks the same one without, in
-    any order. GRAMMAR has them all.
+    Settings are separated by commas and hold both ways. With the prefix ``up.`` (state to edge) or
+    ``down.`` (command to simulator) a setting holds that way alone and outranks the same one
+    without, in any order. GRAMMAR has them all.
     """
-    given: dict[str, dict[str, Any]] = {"": {}, "up": {}, "down": {}}
+    settings: dict[str, dict[str, Any]] = {"": {}, "up": {}, "down": {}}
     parts = [part.strip() for part in text.split(",")] if text.strip() else ["none"]
     text = ",".join(parts)
     try:
@@ -180,13 +180,13 @@ def parse_spec(text: str) -> LatencySpec:
                 if name not in SETTINGS:
                     raise UserError(f"{part!r} is not understood; write {GRAMMAR}")
                 row, about = SETTINGS[name].name, SETTINGS[name].metadata
-                if row in given[prefix]:
+                if row in settings[prefix]:
                     raise UserError(f"{name} is set twice")
                 try:
-                    given[prefix][row] = about["read"](word)
+                    settings[prefix][row] = about["read"](word)
                 except ValueError:
                     raise UserError(f"{part!r}: write it like {name}={about['example']}") from None
-        up, down = (DirectionSpec(**given[""] | given[way]) for way in DIRECTIONS)
+        up, down = (DirectionSpec(**settings[""] | settings[way]) for way in DIRECTIONS)
         return LatencySpec(up, down, text)
     except UserError as error:
         raise UserError(f"latency {text!r}: {error}") from None
@@ -199,11 +199,11 @@ def _pareto(draw: float) -> float:
 
 
 SHAPES: dict[str, Callable[[float], float]] = {NORMAL: lambda draw: draw, PARETO: _pareto}
-"""How long a message is under way: shapes with mean 0 and standard deviation 1.
+"""Shapes of the delay's distribution, with mean 0 and standard deviation 1.
 
 The delay is ``delay + jitter * shape``, as with netem's distribution tables. Both shapes are
-increasing functions of one normal draw: the same seed delays the same messages. A long-tailed
-network has a floor of ``delay - 0.58 jitter`` and rare, very late messages.
+increasing functions of one normal draw: the same seed delays the same messages. The Pareto shape
+has a floor of ``delay - 0.58 jitter`` and rare, very late messages.
 """
 
 
@@ -229,8 +229,8 @@ def loss_percents(spec: DirectionSpec, rng: np.random.Generator) -> Iterator[flo
 class LatencyModel:
     """One direction of the network. Not thread-safe; time must not run backwards.
 
-    Each feature draws from a stream of its own, for every message, so that two specifications with
-    the same seed meet the same luck and differ only in what was specified.
+    Each feature draws from a random stream of its own, for every message: two specifications with
+    the same seed differ only in the features that they set differently.
     """
 
     def __init__(self, spec: DirectionSpec, seed: np.random.SeedSequence) -> None:
@@ -292,19 +292,19 @@ class Arrival(Generic[Message]):
     step: int
     arrived_s: float
     message: Message
-    overtaken: bool  # One as new came before: the edge runtime rejects this without answer.
+    overtaken: bool  # A state as new came before: the edge runtime rejects this one unanswered.
 
 
 class VirtualLink(Generic[Message]):
     """An episode's network in virtual time, and the command that the vehicle holds.
 
     For each tick: ``send_state``; ``next_at_edge`` and ``answer`` until None comes; ``decide``.
-    Answers take no virtual time, so an edge runtime notices no gap: the link runs the safety
-    machine itself, from standby at each episode's start, and turns into a safe stop what that would
-    not drive.
+    Answers take no virtual time, so an edge runtime notices no gap. Therefore the link runs the
+    safety machine itself, from standby at each episode's start, and turns an answer into a safe
+    stop where that machine would not drive.
 
-    ``latencies_ms`` has each newest answer's, from state sent to command received; ``stale`` counts
-    the answers that are not newer; ``observation_bytes`` is what a state carries.
+    ``latencies_ms`` holds each newer answer's latency, from state sent to command received;
+    ``stale`` counts the other answers; ``observation_bytes`` is an observation's size.
     """
 
     def __init__(
@@ -348,7 +348,7 @@ class VirtualLink(Generic[Message]):
             return
         if self._safety.mode is safety.Mode.SAFE_STOP:
             command = msgspec.structs.replace(command, mode=SAFE_STOP, reason=self._safety.reason)
-        if command.plan:  # as long as the edge runtime's own silence
+        if command.plan:  # extends the silence as in the edge runtime
             ride_s = len(command.plan) * self._period_s
             self._safety = self._safety._replace(ride_s=ride_s)
         for arrival_s in self._link.down.arrivals(arrival.arrived_s, COMMAND_BYTES):
@@ -356,7 +356,7 @@ class VirtualLink(Generic[Message]):
 
     def decide(self, edge_silent: bool = False) -> Decision:
         """Decide this tick; for ``edge_silent`` see ``CommandHold.decide``."""
-        # Answered already, the vehicle acts at once: nothing newer can come in this tick.
+        # Once its state is answered, the vehicle acts at once: nothing newer can come this tick.
         answered = self.hold.newest_step >= self._step
         return self.hold.decide(self._admitted_s if answered else self._window_end_s, edge_silent)
 

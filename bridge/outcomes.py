@@ -1,4 +1,4 @@
-"""How episodes ended: the words for it, and estimates with 95 % confidence intervals."""
+"""Outcomes of episodes, and estimates with 95 % confidence intervals."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ UNKNOWN = "ended"  # The environment reports neither ``outcome`` nor ``is_succes
 TRUNCATED = "truncated"  # Gymnasium's step limit ended an episode of UNKNOWN outcome
 TIMEOUT = "timeout"  # The same, in an environment that reports other outcomes (`settled`)
 STOPPED, RESTARTED = "stopped", "restarted"  # The person ended the episode
-DISCARDED = "discarded"  # The person threw the episode away: it is shown and not learned from
+DISCARDED = "discarded"  # The person discarded the episode: it is shown but not learned from
 UNTOLD = {UNKNOWN, TRUNCATED, STOPPED, RESTARTED, DISCARDED}
 """Outcomes that say nothing about success."""
 
@@ -42,15 +42,15 @@ def is_told(outcomes: Iterable[str]) -> bool:
 def settled(outcomes: Iterable[str]) -> list[str]:
     """Return the outcomes, with TIMEOUT for TRUNCATED if any episode reports how it ended."""
     outcomes = list(outcomes)
-    told = is_told(outcomes)
-    return [TIMEOUT if told and each == TRUNCATED else each for each in outcomes]
+    is_reported = is_told(outcomes)
+    return [TIMEOUT if is_reported and each == TRUNCATED else each for each in outcomes]
 
 
 UPPER = 0.975  # Quantile at the upper end of a 95 % interval
 
 
 class Estimate(NamedTuple):
-    """A number with its interval; the interval is infinite where there are too few values."""
+    """A number with its interval, which is infinite for less than two values."""
 
     value: float
     low: float
@@ -67,7 +67,7 @@ class Estimate(NamedTuple):
         return shown.times(100.0).text(1)
 
     def text(self, digits: int = 2) -> str:
-        """Return "0.97 [0.93, 0.99]"; without an interval the value, a dash without values."""
+        """Return "0.97 [0.93, 0.99]"; without an interval the value; without values a dash."""
         if not self.size:
             return "–"
         value, low, high = (f"{number:.{digits}f}" for number in self[:3])

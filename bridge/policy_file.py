@@ -1,6 +1,6 @@
-"""Write policy files; and ``python -m deploy policy``, which makes one of any ONNX model.
+"""Write policy files; and ``python -m deploy policy``, which makes one from any ONNX model.
 
-The manifest comes from the environment, which the model then answers for a while.
+The manifest comes from the environment, on whose observations the model is then tried.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from edge_runtime.manifest import MANIFEST_KEY, Action, Manifest, Task, check_ta
 from edge_runtime.tls import read_signing_key
 from edge_runtime.util import UserError, read_bytes
 
-REAL_OBSERVATIONS, HELD_STEPS = 200, 5  # Steps of one random action: it gets farther
-FOREIGN = "foreign"  # The algorithm of a model that says nothing of its own
+REAL_OBSERVATIONS, HELD_STEPS = 200, 5  # A random action is held for 5 steps, to get farther
+FOREIGN = "foreign"  # The algorithm of a model that does not name its own
 TOLERANCE = 1e-5  # Of an action of about 1: two runtimes round differently
 BEARABLE = 100.0
-"""Most that the first layer of a network may get: of trained ones it is 0.5 to 5, and some 100
-where bytes are not scaled."""
+"""Largest plausible output of a first layer: trained networks have 0.5 to 5, and about 100 where
+bytes are not scaled."""
 FIRST_LAYERS = ("Conv", "Gemm", "MatMul")
 Arrays = Mapping[str, np.ndarray]  # An observation, by entry
 Act = Callable[[Arrays], np.ndarray]
-"""What a network's own library answers, in the environment's units."""
+"""The answer of a network's own library, in the environment's units."""
 
 
 class Model(NamedTuple):
@@ -118,9 +118,9 @@ def changed(task: Task, changes: Sequence[str]) -> Task:
 
 
 def make_policy(model: bytes, task: Task, algorithm: str, training: dict[str, Any]) -> bytes:
-    """Return a policy file's bytes: the model with its manifest in it; UserError where none can be.
+    """Return a policy file's bytes: the model with its manifest. Raises UserError.
 
-    A single input and a single output may have any name and get the manifest's.
+    A single input or output may have any name; it is renamed to the manifest's.
     """
     edge.check_graph(model)
     graph = onnx.load_from_string(model)
@@ -151,19 +151,19 @@ def _rename(graph: onnx.GraphProto, old: str, new: str) -> None:
 def try_policy(
     policy: edge.Policy, environment: Environment, data: bytes, act: Act | None
 ) -> float:
-    """Ask the policy in REAL_OBSERVATIONS steps; return how far it is from its own library's.
+    """Try the policy for REAL_OBSERVATIONS steps; return its largest difference from its library.
 
-    ``data`` is its file, and ``act`` its library. Raises UserError for an action that either does
-    not give. Warns where answers or observations are probably in other units.
+    ``data`` is its file, and ``act`` its library. Raises UserError for an action that is out of
+    range, or differs. Warns where answers or observations are probably in other units.
     """
     environment.action_space.seed(0)
-    adapter, over, seen = Adapter(environment, policy.manifest), True, None
+    adapter, over, observation = Adapter(environment, policy.manifest), True, None
     answers, reaches, apart = [], [], [0.0]
     reach_of = _first_layers(data)
     for step in range(REAL_OBSERVATIONS):
         if over:
-            seen, _ = environment.reset(seed=step)
-        entries = policy.layout.arrays(adapter.pack(seen))
+            observation, _ = environment.reset(seed=step)
+        entries = policy.layout.arrays(adapter.pack(observation))
         try:
             action = policy.act(entries)
             reaches.append(reach_of(entries))
@@ -175,11 +175,11 @@ def try_policy(
             apart.append(float(np.abs(act(entries) - action).max()))
         if step % HELD_STEPS == 0:
             driven = adapter.within(environment.action_space.sample())
-        seen, _, terminated, truncated, _ = environment.step(driven)
+        observation, _, terminated, truncated, _ = environment.step(driven)
         over = terminated or truncated
     widest = max(1.0, *(max(-row.low, row.high) for row in policy.manifest.action))
     if not max(apart) <= TOLERANCE * widest:
-        raise UserError(f"its own library answers otherwise: they differ by {max(apart):.1e}")
+        raise UserError(f"its own library answers differently, by {max(apart):.1e}")
     if not act and max(answers) <= 1.0 + TOLERANCE < widest:
         warn("all its answers lie within -1 to 1, and the range is wider: does it scale them?")
     if (reach := np.median(reaches)) > BEARABLE:
@@ -189,7 +189,7 @@ def try_policy(
 
 
 def _first_layers(data: bytes) -> Callable[[Arrays], float]:
-    """Return what tells the 99th percentile of an ONNX model's first layers, before activation."""
+    """Make a function: 99th percentile of |output| of a model's first layers, before activation."""
     model, names, deep = onnx.load_from_string(data), list[str](), set[str]()
     for node in model.graph.node:
         is_deep, is_layer = not deep.isdisjoint(node.input), node.op_type in FIRST_LAYERS
@@ -202,8 +202,8 @@ def _first_layers(data: bytes) -> Callable[[Arrays], float]:
     network = edge.open_network(model.SerializeToString())
 
     def reach_of(entries: Arrays) -> float:
-        found = network.run(names, {name: array[np.newaxis] for name, array in entries.items()})
-        return float(np.percentile(np.abs(np.concatenate([*map(np.ravel, found)])), 99))
+        outputs = network.run(names, {name: array[np.newaxis] for name, array in entries.items()})
+        return float(np.percentile(np.abs(np.concatenate([*map(np.ravel, outputs)])), 99))
 
     return reach_of
 
@@ -223,5 +223,5 @@ def write_policy(data: bytes, path: Path, key_file: Path | str | None) -> None:
     write_atomic(path, data)
     if key is not None:
         write_atomic(signature_path, key.sign(data))
-    else:  # A signature of an older file beside it would only mislead.
+    else:  # The signature of an older file would mislead.
         signature_path.unlink(missing_ok=True)

@@ -36,10 +36,10 @@ from edge_runtime.util import UserError, counted
 from edge_runtime.wire import DEFAULT_VEHICLE_ID, MAX_STATE_BYTES, Health, check_vehicle_id, key
 
 ANY_VEHICLE = "*"
-POLL_S = 0.1  # How soon a listener sees that the simulator has gone
-NOT_WRITTEN = 1  # Exit status where the disk did not take the recording to its end
+POLL_S = 0.1  # How soon a listener notices that the simulator has gone
+NOT_WRITTEN = 1  # Exit status if the disk was full before the recording's end
 LINGER_S = 2.0  # A simulator that stalls for longer than Zenoh's lease, 1 s, comes back
-TOKEN_S = 1.0  # A simulator that is there has this time to say so, however short the wait asked for
+TOKEN_S = 1.0  # Least time for a simulator's token to arrive, however short a wait was given
 QUEUE_MESSAGES = 2000  # About a minute of real time, all topics together
 QUERY_S = 1.0
 
@@ -50,7 +50,7 @@ def scene_payload(environment: Any, stamps: Scene) -> bytes:
         if (scene := scene_of(environment)) is not None:
             return encode_scene(scene, stamps)
         stamps = msgspec.structs.replace(stamps, picture=picture_of(environment))
-    except Exception as error:  # Somebody else's code; the drive goes on
+    except Exception as error:  # Foreign code; the drive goes on
         say_once(f"the environment cannot be shown: {type(error).__name__}")
     return encode_scene({}, stamps)
 
@@ -61,18 +61,18 @@ class EdgeStatus(Health, frozen=True, kw_only=True):
     manifest: Manifest
 
     def rejected_since(self, before: EdgeStatus) -> Counter[str]:
-        """Return the states rejected in between, by reason; a restarted one counts from zero."""
+        """Return the states rejected in between, by reason; a restarted runtime began at zero."""
         is_same = self.policy_id == before.policy_id and self.uptime_s >= before.uptime_s
         return Counter(self.rejected) - Counter(before.rejected if is_same else {})
 
 
 class SimulatorPort(transport.SimulatorEnd):
-    """The end that also shows scenes, and sees whether an edge runtime lives."""
+    """A simulator's end that also publishes scenes and queries the edge runtime."""
 
     def publish_scene(self, environment: Any, stamps: Scene) -> None:
         """Send the scene, or else the environment's picture, if anybody is listening."""
-        somebody: Any = self.scenes.matching_status
-        if somebody.matching:
+        listeners: Any = self.scenes.matching_status
+        if listeners.matching:
             self.scenes.put(scene_payload(environment, stamps))
 
     def wait_for_edge(self, limit_s: float, start: str) -> EdgeStatus:
@@ -85,7 +85,7 @@ class SimulatorPort(transport.SimulatorEnd):
         return status
 
     def edge_status(self) -> EdgeStatus | None:
-        """Ask the edge runtime how it is; None without an answer that can be read."""
+        """Query the edge runtime's status; None without a readable answer."""
         for reply in self._zenoh.get(key(self.vehicle_id, "status"), timeout=QUERY_S):
             with contextlib.suppress(msgspec.MsgspecError, ValueError, RecursionError):
                 if reply.ok is not None:
@@ -97,7 +97,7 @@ open_port = partial(transport.open_simulator, SimulatorPort)
 
 
 class WireListener:
-    """Queues messages in order of arrival, and knows whether their simulators are there."""
+    """Queues messages in order of arrival, and keeps track of the simulators' tokens."""
 
     def __init__(self) -> None:
         self.simulator_seen = threading.Event()
@@ -118,9 +118,9 @@ class WireListener:
         return None
 
     def until_gone(self, linger_s: float = LINGER_S) -> Iterator[Heard | None]:
-        """Yield messages, and None where none comes, until no simulator was there for ``linger_s``.
+        """Yield messages, and None while none comes, until no simulator was there for ``linger_s``.
 
-        An edge runtime behind a router goes on sending without a simulator.
+        Silence is no end: an edge runtime behind a router goes on sending without a simulator.
         """
         seen_s = time.monotonic()
         while time.time() < self.end_s and not self._is_stopped:
@@ -132,7 +132,7 @@ class WireListener:
                 return
 
     def hear(self, sample: zenoh.Sample) -> None:
-        """Queue a message; a flood of huge ones must not fill the memory."""
+        """Queue a message; of an oversized one only the size, to bound the memory."""
         size = len(sample.payload)
         self._put(sample, sample.payload.to_bytes() if size <= MAX_STATE_BYTES else b"", size)
 
@@ -147,7 +147,7 @@ class WireListener:
     def _put(self, sample: zenoh.Sample, payload: bytes, size: int) -> None:
         key = str(sample.key_expr)
         if "*" in key:
-            return  # Put to many vehicles at once: no vehicle's own
+            return  # It was put to a wildcard of many vehicles
         topic, arrived_ns = key.rpartition("/")[2], self._zero_ns + time.monotonic_ns()
         try:
             self.queue.put_nowait(Heard(key, topic, payload, arrived_ns, size))
@@ -161,7 +161,7 @@ def open_listener(
 ) -> Iterator[WireListener]:
     """Listen to one vehicle, or to ANY_VEHICLE.
 
-    UserError if no simulator for it is at ``connect`` within ``wait_s``, or a certificate may not.
+    UserError if no simulator of it is at ``connect`` within ``wait_s``, or without the right.
     """
     if tls is not None:
         own = [access.common_name(access.SHADOW, vehicle_id)] if vehicle_id != ANY_VEHICLE else []
@@ -172,14 +172,14 @@ def open_listener(
         listener, keys = WireListener(), f"phil/{vehicle_id}"
         if tls is not None:
             listener.end_s = tls.expires.timestamp()
-        # On Zenoh's own thread: with one for each topic, their order would be anybody's guess.
+        # On Zenoh's own thread: one thread for each topic would lose the messages' order.
         hear = zenoh.handlers.Callback(listener.hear, indirect=False)
         for topic in DECODERS.keys() - {SHADOW}:
             stack.enter_context(session.declare_subscriber(f"{keys}/{topic}", hear))
         declare = session.liveliness().declare_subscriber
         for topic in TOKEN_TOPICS:
             stack.enter_context(declare(f"{keys}/{topic}", listener.watch, history=True))
-        # Where the vehicle never was, nothing would tell the listener to end.
+        # Without a first token, the listener would never see a simulator go.
         if not listener.simulator_seen.wait(max(TOKEN_S, give_up_s - time.monotonic())):
             where = f"vehicle {vehicle_id} at {connect}"
             raise UserError(f"no simulator of {where}; start one, or name another --vehicle-id")
@@ -190,8 +190,8 @@ def open_listener(
 
 @contextlib.contextmanager
 def open_source(arguments: Any) -> Iterator[Iterator[Heard | None]]:
-    """Yield one vehicle's messages: of the file ``arguments.recording``, or on the wire until its
-    simulator goes; None where none comes for a moment.
+    """Yield one vehicle's messages: from the file ``arguments.recording``, or from the wire until
+    its simulator goes; None while none comes.
     """
     if arguments.recording:
         recording = Recording(Path(arguments.recording))
@@ -208,7 +208,7 @@ def open_source(arguments: Any) -> Iterator[Iterator[Heard | None]]:
 def _say_dropped(listener: WireListener) -> None:
     if listener.dropped:
         dropped = counted(listener.dropped, "message")
-        print(f"{dropped} came faster than they could be taken", file=sys.stderr)
+        print(f"dropped {dropped}: they came too fast", file=sys.stderr)
 
 
 ENDPOINT = {"metavar": "PROTOCOL/HOST:PORT", "type": transport.check_endpoint}
@@ -243,7 +243,7 @@ def add_options(parser: Any, *names: str, **changes: Any) -> None:
 def wait_to_be_told(tls: TlsFiles | None = None) -> NoReturn:
     """Sleep until KeyboardInterrupt (main thread only); UserError when ``tls`` has expired.
 
-    A signal that the kernel hands to a thread of Zenoh's wakes nobody from a lock: so it polls.
+    Polls, because a signal that one of Zenoh's threads gets does not wake a waiting main thread.
     """
     while True:
         time.sleep(transport.RETRY_S)
@@ -266,7 +266,7 @@ def router(parser: Any) -> None:
 
 
 def run_router(arguments: Any) -> int:
-    """Route until SIGTERM or ^C; without ``--tls``, everything that anybody sends."""
+    """Route until SIGTERM or ^C; without ``--tls`` everybody has all rights."""
     listens, connect = arguments.listen or [transport.DEFAULT_ENDPOINT], arguments.connect
     tls, rules = transport.tls_for(arguments.tls, *listens, *[connect] * bool(connect)), None
     if tls is not None:
@@ -306,7 +306,7 @@ def run_record(arguments: Any) -> int:
     ):
         print(f"recording {path}", flush=True)
         try:
-            # A signal is the ordinary way to end a recording: it must not cut a message in two.
+            # A signal is the usual end of a recording: it must not cut a message in two.
             with cli.quit_on_signals(listener.stop):
                 _listen(listener, writer, arguments.linger_s)
                 writer.finish()
@@ -321,7 +321,7 @@ def run_record(arguments: Any) -> int:
 
 def _listen(listener: WireListener, writer: RecordingWriter, linger_s: float) -> None:
     for heard in filter(None, listener.until_gone(linger_s)):
-        # Under a flood the copies for viewers are the first to go.
+        # In a flood the copies for viewers are dropped first.
         writer.write(heard, with_view=listener.queue.qsize() < QUEUE_MESSAGES // 2)
 
 
@@ -353,8 +353,8 @@ def add_view(parser: Any, default: str = "") -> None:
     text = f"serve Foxglove, on this machine's loopback only (default port: {FOXGLOVE_PORT})"
     number: Any = {"type": cli.whole_number(1, 65535), "const": FOXGLOVE_PORT}
     add("--foxglove", nargs="?", metavar="PORT", help=text, **number)
-    text = "of --serve: the page's port, and N + 1 for its data (default: two that are free)"
+    text = "with --serve: port of the page; N + 1 is for its data (default: two free ports)"
     parser.add_argument("--port", metavar="N", type=cli.whole_number(1, 65534), help=text)
     add_options(parser, "--connect", "--tls", "--wait-s")
-    text = f"the vehicle (default: {DEFAULT_VEHICLE_ID}; of a recording: the only one)"
+    text = f"the vehicle (default: {DEFAULT_VEHICLE_ID}; in a recording: the only one)"
     add_options(parser, "--vehicle-id", default=None, help=text)

@@ -35,18 +35,18 @@ from edge_runtime.util import UserError, counted, open_regular
 WIRE_ENCODING = "msgpack"
 ENCODING, SCHEMA_ENCODING = "json", "jsonschema"  # Of the copies for viewers
 CHUNK_BYTES = 1 << 20
-FLUSH_S = 0.5  # A kill loses at most this much of a recording, and what waits in the queue
+FLUSH_S = 0.5  # A kill loses at most this much of a recording, and the waiting messages
 MAX_RECORD_BYTES = 8 << 20
-"""Of a record, and of a chunk when it is unpacked; ours hold little more than 5 MiB."""
+"""Of a record, and of an unpacked chunk; ours hold little more than 5 MiB."""
 TORN = (
     McapError, struct.error, zstandard.ZstdError, ValueError, KeyError, RuntimeError, OverflowError,
     MemoryError,
 )  # fmt: skip
-"""Exceptions of the libraries for bytes that are no MCAP. Anybody may have made the file."""
+"""Exceptions of the libraries for bytes that are no MCAP: the file may come from anybody."""
 
 
 class Recording:
-    """One MCAP file; what is missing of it is known once ``messages`` has come to the end."""
+    """One MCAP file; ``cut_off`` and ``damaged_places`` are known at the end of ``messages``."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -59,7 +59,7 @@ class Recording:
         if self.damaged_places:
             trouble = f"has {counted(self.damaged_places, 'damaged place')}"
         if trouble:
-            line = f"the recording {self.path} {trouble}; what is whole of it is taken"
+            line = f"the recording {self.path} {trouble}; its intact part is used"
             print(line, file=sys.stderr, flush=True)
 
     def messages(self) -> Iterator[tuple[Channel, Message]]:
@@ -83,11 +83,11 @@ class Recording:
                         yield channels[record.channel_id], record
         except OSError as error:
             raise UserError(f"recording {self.path} cannot be read: {error.strerror}") from None
-        if summary.statistics is not None:  # Some may have been no chunks to the reader.
+        if summary.statistics is not None:  # Some chunks may not have been recognised as such
             self.damaged_places = max(0, summary.statistics.chunk_count - self._whole_chunks)
 
     def _records(self, stream: BinaryIO) -> Iterator[McapRecord]:
-        """Yield what the chunks hold; no checksum is over a record outside of them."""
+        """Yield the records in chunks; those outside have no checksum."""
         reader = StreamReader(stream, True, True, record_size_limit=MAX_RECORD_BYTES)
         with contextlib.suppress(*TORN):
             for record in reader.records:
@@ -108,22 +108,22 @@ class Recording:
 
 
 def _summary(stream: BinaryIO) -> Summary:
-    """Return the index, which repeats all channels: the chunk that names one may be damaged."""
+    """Return the index, which repeats all channels: a chunk that defines one may be damaged."""
     with contextlib.suppress(*TORN, OSError):
         stream.seek(0)
-        if found := SeekingReader(stream, record_size_limit=MAX_RECORD_BYTES).get_summary():
-            return found
+        if summary := SeekingReader(stream, record_size_limit=MAX_RECORD_BYTES).get_summary():
+            return summary
     return Summary()
 
 
 def choose_vehicle(recording: Recording, vehicle_id: str | None) -> str:
     """Return the vehicle of that id, or the only vehicle; UserError where that fails."""
-    there = {_wire_topic(channel)[0] for channel, _ in recording.messages()} - {""}
-    names = ", ".join(sorted(there)) or "none"
-    found = there & {vehicle_id} if vehicle_id else there
-    if len(found) != 1:
+    vehicles = {_wire_topic(channel)[0] for channel, _ in recording.messages()} - {""}
+    names = ", ".join(sorted(vehicles)) or "none"
+    chosen = vehicles & {vehicle_id} if vehicle_id else vehicles
+    if len(chosen) != 1:
         raise UserError(f"{recording.path} holds vehicles {names}; name one with --vehicle-id")
-    return found.pop()
+    return chosen.pop()
 
 
 def heard_of(recording: Recording, vehicle_id: str) -> Iterator[Heard]:
@@ -135,7 +135,7 @@ def heard_of(recording: Recording, vehicle_id: str) -> Iterator[Heard]:
 
 
 def valid_messages(recording: Recording, vehicle_id: str) -> Iterator[tuple[Heard, Any]]:
-    """Yield a drive's messages, heard and decoded; the invalid, and a shadow's, are left out."""
+    """Yield a drive's messages, raw and decoded, without invalid ones and a shadow's."""
     for heard in heard_of(recording, vehicle_id):
         if heard.topic in DECODERS and heard.topic != SHADOW:
             message = decode(heard)
@@ -159,7 +159,7 @@ class RecordingWriter:
         self._flush_s = 0.0  # When the chunk ends
         self._copies = ViewerCopies(self._add_copy)
         self._file, self._mcap = new_recording_at(path)
-        # Each is registered once; with its schema, as a picture may have the name of a message.
+        # Each is registered once, by name and schema: a picture may have a message's name.
         self._channel = functools.cache(self._mcap.register_channel)
         self._schema = functools.cache(self._mcap.register_schema)
 
@@ -177,7 +177,7 @@ class RecordingWriter:
             self.flush()
 
     def flush(self) -> None:
-        """End the chunk: a kill does not lose what was written before."""
+        """End the chunk, so that a kill does not lose it."""
         self._mcap.flush()
         self._flush_s = time.monotonic() + FLUSH_S
 
@@ -207,7 +207,7 @@ def new_recording_at(path: Path) -> tuple[BinaryIO, Writer]:
     try:
         writer = Writer(stream, CHUNK_BYTES, CompressionType.ZSTD, enable_data_crcs=True)
         writer.start(profile="", library=f"phil-hil {__version__}")
-        writer.flush()  # Before anybody is told of the file, it is an MCAP file.
+        writer.flush()  # The file is a valid MCAP file before anybody learns of it.
     except OSError as error:
         with contextlib.suppress(OSError):
             stream.close()
@@ -218,7 +218,7 @@ def new_recording_at(path: Path) -> tuple[BinaryIO, Writer]:
 
 @contextlib.contextmanager
 def whole_recording(path: str | Path) -> Iterator[RecordingWriter]:
-    """Write a recording in one go; where that fails, no file is left."""
+    """Write a whole recording; leave no file where that fails."""
     writer = RecordingWriter(path := Path(new_recording(path)))
     with contextlib.closing(writer):
         try:
@@ -237,7 +237,7 @@ def new_recording(path: str | Path) -> str:
     return str(Path(path).absolute())
 
 
-# Foxglove's own message types, with the fields that we fill; it takes the others as empty.
+# Foxglove's own message types, with the fields that we fill; it reads the others as empty.
 define: Any = msgspec.defstruct
 many = list.__class_getitem__
 Stamp = define("Time", [("sec", int), ("nsec", int)])
@@ -290,18 +290,18 @@ def describe(kind: Any) -> Schema:
     name, parts = kind.__name__, msgspec.json.schema_components([kind], ref_template="{name}")[1]
 
     def plain(part: dict[str, Any]) -> dict[str, Any]:
-        """Foxglove's readers know no references, alternatives, or objects with any keys."""
+        """Resolve references and alternatives, which Foxglove's readers do not know."""
         part = part.get("anyOf", [part])[0]
         part = parts[part["$ref"]] if "$ref" in part else part
-        found: dict[str, Any] = {
+        schema: dict[str, Any] = {
             key: part[key] for key in ("type", "contentEncoding") if key in part
         }
         if part["type"] == "object":
             fields = part.get("properties", {}).items()
-            found["properties"] = {n: plain(field) for n, field in fields if n not in NOT_COPIED}
+            schema["properties"] = {n: plain(field) for n, field in fields if n not in NOT_COPIED}
         if part["type"] == "array":
-            found["items"] = plain(part["items"])
-        return found
+            schema["items"] = plain(part["items"])
+        return schema
 
     package = "foxglove" if kind in FOXGLOVE else "phil"
     return f"{package}.{name}", msgspec.json.encode(plain(parts[name]))
@@ -348,7 +348,7 @@ class ViewerCopies:
         for name, array in layout.arrays(state.observation).items():
             if (images := images_of(array)) is None:
                 continue
-            # They lie one after the other: in memory that is one picture, so many times as high.
+            # Consecutive images are, in memory, one picture with `count` times the height.
             count, height, width, colours = images.shape
             encoding = "rgb8" if colours == 3 else "mono8"
             size = (width, count * height, encoding, width * colours)

@@ -1,7 +1,7 @@
 """``python -m bridge replay``: run recorded states through a policy and compare its commands.
 
 The policy runs inside the edge runtime's own decision logic, at the times that the recorded
-runtime stamped, by the recorder's clock: two replays of one file are the same.
+runtime stamped, on the recorder's clock: two replays of one file are the same.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from edge_runtime.util import UserError, name_in_file, printable
 from edge_runtime.vehicles import find_vehicle, vehicle_limits
 from edge_runtime.wire import DRIVE, Command, Health, State, is_foreign
 
-RUNTIME_ENDED = "runtime_ended"  # Reason of a runtime's farewell, which answers no state
+RUNTIME_ENDED = "runtime_ended"  # Reason of a runtime's last command, which answers no state
 JUST_AFTER_S = 1e-6  # A watchdog wakes at its deadline or later, never before
 RESTART_S = 0.5  # Starts that are further apart belong to two runtimes
-CLOCK_STEP_S = 1.0  # Stamps that leap by more against the recorder's: a clock was set
+CLOCK_STEP_S = 1.0  # A larger leap of stamps against the recorder's clock: a clock was set
 DEFAULT_TOLERANCE = 1e-5  # Two processors round differently, by far less than this
 DIFFERENT = 1  # Exit status where at least one command differs
 SHOWN_DIFFERENCES = 10
-MOST_PANELS = 8  # Of a picture, one an action
+MOST_PANELS = 8  # Of a picture, one for each action
 
 Key = tuple[str, int, int]  # Session, episode, step
 
@@ -54,7 +54,7 @@ class Exchange(NamedTuple):
 
 
 Row = tuple[State, Command | None, Order | None]
-"""A state with its recorded answer and the replayed one; no recorded answer of the policy: None."""
+"""A state, the policy's recorded answer (None if it has none), and the replayed answer."""
 EXAMPLE = examples("python -m bridge replay drive.mcap --policy my.onnx --public-key policy.pub")
 
 
@@ -75,7 +75,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(arguments: Any) -> int:
-    """Run the command: 0 where every command is the same, 1 where one differs."""
+    """Replay, report, and return 0 if every command is the same, 1 if one differs."""
     drive = RecordedDrive(Path(arguments.recording), arguments.vehicle_id)
     policy = load_policy(arguments.policy, arguments.public_key, arguments.allow_unsigned)
     config = load_config(arguments.config, {"policy": arguments.policy}, opens_link=False)
@@ -99,7 +99,7 @@ def run(arguments: Any) -> int:
 def report_on(
     drive: RecordedDrive, policy: Policy, rows: Iterable[Row], tolerance: float = DEFAULT_TOLERANCE
 ) -> dict[str, Any]:
-    """Return the command's report on what `replay` gave. UserError where nothing is compared."""
+    """Return the report on the rows of `replay`. UserError where nothing is compared."""
     report = {
         "recording": str(drive.recording.path),
         "policy_id": policy.policy_id,
@@ -114,8 +114,8 @@ def report_on(
 class RecordedDrive:
     """One vehicle's part of a recording; states are read from the file when they are needed.
 
-    ``answers`` has for each state the policy's first answer, or else the watchdog's, which took no
-    inference. Raises UserError where nobody answered a state.
+    ``answers`` has for each state the policy's first answer, or else the watchdog's (without an
+    inference). Raises UserError where no state was answered.
     """
 
     def __init__(self, path: Path, vehicle_id: str | None) -> None:
@@ -124,9 +124,9 @@ class RecordedDrive:
         self.answers: dict[Key, Exchange] = {}
         self.vehicle = NONE
         self.task: Task | None = None  # As the simulator's scenes say
-        self.starts_s: list[float] = []  # Of the edge runtimes, one after the other
+        self.starts_s: list[float] = []  # Start times of the edge runtimes, one after the other
         zero_ns: int | None = None
-        self._lead_s: float | None = None  # Of the recorder's clock before the runtime's
+        self._lead_s: float | None = None  # Recorder's clock minus the runtime's
         self._newest_s = -math.inf  # Arrival of the newest state
         for heard, message in valid_messages(self.recording, self.vehicle_id):
             zero_ns = heard.arrived_ns if zero_ns is None else zero_ns
@@ -134,9 +134,9 @@ class RecordedDrive:
             if heard.topic == "scene":
                 self.task = self.task or message.task
             elif isinstance(message, Command) and message.reason != RUNTIME_ENDED:
-                known = self.answers.get(key_of(message))
+                first = self.answers.get(key_of(message))
                 exchange = self._exchange(message, heard_s)
-                if known is None or (message.inference_ns and not known.command.inference_ns):
+                if first is None or (message.inference_ns and not first.command.inference_ns):
                     self.answers[key_of(message)] = exchange
             elif isinstance(message, Health):
                 self.vehicle = message.vehicle
@@ -149,20 +149,20 @@ class RecordedDrive:
             raise UserError(f"{path} holds no answered state of vehicle {self.vehicle_id}")
 
     def _exchange(self, command: Command, heard_s: float) -> Exchange:
-        """Carry a command's stamps over to the recorder's clock."""
+        """Convert a command's stamps to the recorder's clock."""
         stamp_s = command.sent_ns * 1e-9
         lead_s = heard_s - stamp_s
         if self._lead_s is None or abs(lead_s - self._lead_s) > CLOCK_STEP_S:
             self._lead_s = lead_s
         sent_s = stamp_s + self._lead_s
-        # By one clock, unless that was set between the two stamps; states arrive in order.
+        # Both stamps are of one clock, unless it was set in between; states arrive in order.
         took_s = (command.sent_ns - command.received_ns) * 1e-9
         arrived_s = sent_s - (took_s if 0.0 <= took_s < CLOCK_STEP_S else 0.0)
         self._newest_s = max(self._newest_s, arrived_s)
         return Exchange(command, self._newest_s, max(sent_s, self._newest_s))
 
     def states(self) -> Iterator[State]:
-        """Yield the states in their order, each once: a network may repeat a message."""
+        """Yield the states in order, each once: a network may repeat a message."""
         seen: set[Key] = set()
         for _, state in valid_messages(self.recording, self.vehicle_id):
             if isinstance(state, State) and key_of(state) not in seen:
@@ -177,9 +177,9 @@ def key_of(message: State | Command) -> Key:
 def replay(drive: RecordedDrive, policy: Policy, config: Config) -> Iterator[Row]:
     """Yield every state with its recorded and its replayed answer.
 
-    The recording says which vehicle was attached, when it failed, when an operator re-armed (before
-    a state that was answered with ``drive``), and when the runtime was started anew. Its limits
-    follow from ``config``. UserError where it lacks an action of the policy.
+    The recording shows which vehicle was attached, when it failed, when an operator re-armed
+    (before a state that was answered with ``drive``), and when the runtime was restarted. The
+    vehicle's limits follow from ``config``. UserError where it lacks an action of the policy.
     """
     limits = shared_limits(policy.manifest.action, _vehicle_limits(drive, policy, config))
     commands = [each.command for each in drive.answers.values()]
@@ -200,7 +200,7 @@ def replay(drive: RecordedDrive, policy: Policy, config: Config) -> Iterator[Row
 
 
 def _vehicle_limits(drive: RecordedDrive, policy: Policy, config: Config) -> Limits:
-    """Return the limits of the recorded vehicle; no recording decides what is imported."""
+    """Return the limits of the recorded vehicle; a recording never decides what is imported."""
     name = drive.vehicle
     if NONE not in (name, config.vehicle) and find_vehicle(config.vehicle).name == name:
         name = config.vehicle  # A module:Class; the recording has the class's name
@@ -222,14 +222,14 @@ def controller_of(
     commands = [*commands]
     ride_s = period_s * max((len(command.plan or ()) for command in commands), default=0)
     each = any(command.reason == Event.EPISODE.value for command in commands)
-    decides = ControllerConfig(limits, period_s, needs_rearm, is_armed, task, ride_s, each)
-    return Controller(decides)
+    config = ControllerConfig(limits, period_s, needs_rearm, is_armed, task, ride_s, each)
+    return Controller(config)
 
 
 def _answer(
     controller: Controller, policy: Policy, state: State, exchange: Exchange
 ) -> Order | None:
-    """Return what the runtime answers to the state: None where only its watchdog would speak."""
+    """Return the runtime's answer to the state, None where only its watchdog would send one."""
     recorded, arrived_s, sent_s = exchange
     layout, begun_s = policy.layout, max(arrived_s, sent_s - recorded.inference_ns * 1e-9)
     if not recorded.inference_ns:
@@ -243,7 +243,7 @@ def _answer(
     output = None
     if layout.refusal(state.observation) is None and not is_foreign(state, layout.task_text):
         output, _ = infer(policy, layout.arrays(state.observation))
-    # How long a vehicle's fault stood is not recorded, and need not be: the stop is latched.
+    # The recording lacks a vehicle fault's duration, which does not matter: the stop is latched.
     fault, is_new = Event.VEHICLE.value, recorded.reason != controller.safety.reason
     if recorded.reason == fault and is_new:
         controller.vehicle_fault = fault
@@ -254,7 +254,7 @@ def _answer(
 
 
 def _watchdog(controller: Controller, until_s: float) -> None:
-    """Let the runtime's deadlines pass. The repetitions of a stop change nothing."""
+    """Let the runtime's deadlines until a time pass; a stop's repetitions are skipped."""
     while controller.safety.mode is Mode.DRIVE:
         due_s = controller.next_deadline_s()
         if due_s is None or due_s + JUST_AFTER_S > until_s:
@@ -263,10 +263,10 @@ def _watchdog(controller: Controller, until_s: float) -> None:
 
 
 def compare(rows: Iterable[Row], tolerance: float) -> dict[str, Any]:
-    """Return the part of the report that says what differs.
+    """Compare the answers; return the report's counts and first differences.
 
-    Two answers are equal where mode and reason are, and no action, planned ones included, is
-    further apart than ``tolerance``. States without a recorded answer are counted only.
+    Two answers are equal if mode and reason are, and no action (planned ones included) differs by
+    more than ``tolerance``. States without a recorded answer are counted only.
     """
     kinds, unanswered, largest = Counter[str](), 0, 0.0
     differences: list[dict[str, Any]] = []
@@ -279,8 +279,8 @@ def compare(rows: Iterable[Row], tolerance: float) -> dict[str, Any]:
         largest = max(largest, distance if distance < math.inf else 0.0)
         if distance > tolerance:
             place = dict(zip(("session", "episode", "step"), key_of(state), strict=True))
-            replayed = None if order is None else _told(order)
-            differences.append({**place, "recorded": _told(recorded), "replayed": replayed})
+            replayed = None if order is None else _row(order)
+            differences.append({**place, "recorded": _row(recorded), "replayed": replayed})
     return {
         "compared": kinds.total(),
         "unanswered": unanswered,
@@ -293,7 +293,7 @@ def compare(rows: Iterable[Row], tolerance: float) -> dict[str, Any]:
 
 
 def draw(rows: Iterable[Row], names: Sequence[str]) -> Any:
-    """Draw the recorded and the replayed answers, state by state: a panel an action."""
+    """Draw recorded and replayed answers, state by state, a panel for each action."""
     from matplotlib.figure import Figure
 
     answers = [(recorded.action, order.action if order else ())
@@ -311,7 +311,7 @@ def draw(rows: Iterable[Row], names: Sequence[str]) -> Any:
     return figure
 
 
-def _told(answer: Command | Order) -> dict[str, Any]:
+def _row(answer: Command | Order) -> dict[str, Any]:
     plan = [value for action in answer.plan or () for value in action]
     return {"mode": answer.mode, "reason": answer.reason, "action": [*answer.action, *plan]}
 
@@ -320,7 +320,7 @@ def _distance(recorded: Command, order: Order | None) -> float:
     """Return the largest difference of two actions; inf for another mode, reason or size."""
     if order is None or (recorded.mode, recorded.reason) != (order.mode, order.reason):
         return math.inf
-    ours, theirs = _told(recorded)["action"], _told(order)["action"]
+    ours, theirs = _row(recorded)["action"], _row(order)["action"]
     if len(ours) != len(theirs):
         return math.inf
     return max((abs(a - b) for a, b in zip(ours, theirs, strict=True)), default=0.0)

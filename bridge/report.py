@@ -1,4 +1,4 @@
-"""Results of episodes, safe stops, and the report with the contract's keys (section 2)."""
+"""Episode results, safe stops, and the report with the contract's keys (section 2)."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ DOTS_PER_INCH, KEPT_COLOURS = 110, 64  # Of a figure
 
 @dataclass
 class EpisodeResult:
-    """One driven episode; `actions` holds what the environment was given in each step.
+    """One driven episode; `actions` holds the environment's action of each step.
 
     `outcome` is the contract's word, the environment's own, FAILED, TRUNCATED or UNKNOWN.
-    Accelerations are the mean of |a| over the steps, None where they are unknown.
+    Accelerations are the mean of |a| over the steps, None if unknown.
     """
 
     seed: int
@@ -58,19 +58,19 @@ def summarise(
 ) -> dict[str, Any]:
     """Settle the outcomes of `results` and return the contract's summary.
 
-    `std` is over the episodes (ddof 0). Mean and deviation of what no episode reports are None.
+    `std` is over the episodes (ddof 0). `mean` and `std` are None if no episode has the quantity.
     """
     for result, outcome in zip(results, settled(r.outcome for r in results), strict=True):
         result.outcome = outcome
     outcomes = Counter(result.outcome for result in results)
-    told = success_estimate(outcomes[GOAL], len(results)) if is_told(outcomes) else None
+    success = success_estimate(outcomes[GOAL], len(results)) if is_told(outcomes) else None
     columns = {key: [getattr(row, name) for row in results] for key, name in QUANTITIES.items()}
     return {
         "scenario": scenario,
         "condition": condition,
         "episodes": len(results),
-        "success_rate": told and told.value,
-        "success_interval": told and [told.low, told.high],
+        "success_rate": success and success.value,
+        "success_interval": success and [success.low, success.high],
         "collision_rate": outcomes[COLLISION] / len(results),
         **{
             key: {"mean": of_known(values), "std": of_known(values, np.std)}
@@ -88,7 +88,7 @@ def accelerations(info: Mapping[str, Any]) -> list[float | None]:
 
 
 def number_of(info: Mapping[str, Any], name: str) -> float | None:
-    """Return a number of a step's ``info``, None where it is unknown; UserError for no number."""
+    """Return a number of a step's ``info``, None if missing; UserError if it is not finite."""
     value = info.get(name)
     return None if value is None else finite(name, value)
 
@@ -112,8 +112,8 @@ class SafeStopEvent:
 class SafeStopLog:
     """Collects the events of a whole run.
 
-    The car also brakes after 2 T without the first command of an episode. Where one of the first
-    states is answered, that was a round trip and is no stop.
+    The car also brakes after 2 T without the first command of an episode. If that command answers
+    one of the first states, the braking was a round trip and is no stop.
     """
 
     def __init__(self) -> None:
@@ -150,7 +150,7 @@ def make_report(
     latencies_ms: Sequence[float],
     facts: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Join the summary with what happened on the wire, and further rows, ``facts``."""
+    """Join the summary, the figures of the wire, and further rows (``facts``)."""
     policy_id = next(reversed(facts["policy_ids"]), "")
     summary = summarise(results, facts["scenario"], facts["condition"], policy_id, facts["seed"])
     return {
@@ -203,7 +203,7 @@ LINE_INTERVAL_S = 15.0  # Between two lines of progress where stderr is no termi
 
 
 class ProgressBar:
-    """Counts to ``total``, with figures such as ``{"success": "0.85"}``; lines if no terminal."""
+    """Counts to ``total``, with figures such as ``{"success": "0.85"}``; lines on no terminal."""
 
     def __init__(self, what: str, total: int, done: int = 0) -> None:
         self.what, self.total, self.done = what, total, done
@@ -212,7 +212,7 @@ class ProgressBar:
             *(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()),
             TextColumn("{task.fields[figures]}", markup=False),
             *(TextColumn("ETA"), TimeRemainingColumn()),
-            speed_estimate_period=math.inf,  # A piece may take hours.
+            speed_estimate_period=math.inf,  # One count may take hours.
             console=Console(stderr=True),
             disable=not sys.stderr.isatty(),
         )

@@ -1,7 +1,7 @@
-"""``python -m bridge shadow``: a policy beside the one that drives; it answers and moves nothing.
+"""``python -m bridge shadow``: run a second policy beside the driving one, moving nothing.
 
-It decides as the edge runtime would, on the wire's states or a recording's. Its answers go into
-view, recording and report only: a listener has no way to publish.
+It decides as the edge runtime would, on the states of the wire or of a recording. Its answers go
+into view, recording and report only: a listener cannot publish.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ from edge_runtime.util import UserError
 from edge_runtime.vehicles import vehicle_limits
 from edge_runtime.wire import DRIVE, SAFE_STOP, Command, Rejection, State
 
-MOST_WAITING = 100  # Answers that wait for the driving policy's; a command may come late, or never
-NICE = 10  # Whatever drives on this machine comes first, and is the last to end
+MOST_WAITING = 100  # Answers that wait for the driving policy's, which may come late, or never
+NICE = 10  # A driving process on this machine has precedence
 OOM_SCORE = Path("/proc/self/oom_score_adj")
 EXAMPLE = cli.examples(
     "python -m bridge shadow --policy next.onnx --serve --out runs/shadow.json",
@@ -64,15 +64,15 @@ def run(arguments: Any) -> int:
     policy = load_policy(arguments.policy, arguments.public_key, arguments.allow_unsigned)
     config = load_config(arguments.config, {"policy": arguments.policy}, opens_link=False)
     shadow, stop = Shadow(policy, config), threading.Event()
-    OOM_SCORE.write_text("1000")  # Where memory ends, the kernel ends this process first
+    OOM_SCORE.write_text("1000")  # When memory runs out, the kernel kills this process first
 
     def messages(all_heard: Iterator[Heard | None]) -> Iterator[Heard]:
-        """Yield the drive with the shadow's answers, recorded; then tell the report."""
-        until_told = takewhile(lambda _: not stop.is_set(), all_heard)
+        """Yield and record the drive with the shadow's answers; then print the report."""
+        until_stop = takewhile(lambda _: not stop.is_set(), all_heard)
         out = whole_recording(arguments.record) if arguments.record else nullcontext()
-        # A signal is an ordinary end: it must not cut a recorded message in two.
+        # A signal is a usual end: it must not cut a recorded message in two.
         with cli.quit_on_signals(stop.set), out as writer:
-            for heard in shadow.stream(until_told):
+            for heard in shadow.stream(until_stop):
                 if writer is not None:
                     writer.write(heard)
                 yield heard
@@ -90,9 +90,9 @@ def run(arguments: Any) -> int:
 
 
 class Shadow:
-    """Answers the states that a driving runtime gets, and compares its actions with that one's.
+    """Answers the states of a driving runtime, and compares its own actions with the driving ones.
 
-    The controller is the edge runtime's, without a vehicle; its limits are those of ``config``'s.
+    The controller is the edge runtime's without a vehicle, but with the limits of ``config``'s.
     """
 
     def __init__(self, policy: Policy, config: Config) -> None:
@@ -101,23 +101,23 @@ class Shadow:
         vehicle = vehicle_limits(config.vehicle, tables, manifest, bounds)
         limits, self._period_s = shared_limits(manifest.action, vehicle), manifest.control_period_s
         self._task, ride_s = policy.layout.task_text, config.ride_through.max_s
-        decides = ControllerConfig(limits, self._period_s, task=self._task, ride_s=ride_s)
-        self._controller, self._latest = Controller(decides), LatestState(self._period_s)
-        self._rejected = "none came"  # Why there was no state
+        settings = ControllerConfig(limits, self._period_s, task=self._task, ride_s=ride_s)
+        self._controller, self._latest = Controller(settings), LatestState(self._period_s)
+        self._rejected = "none came"  # Why the newest state was not taken
         self._thread: threading.Thread | None = None  # Of the newest inference
         self._inferences_ms: list[float] = []
         self._answered, self._would_stop = 0, Counter[str]()
-        self._orders: dict[Key, Order] = {}  # Those that no command was compared with yet
+        self._orders: dict[Key, Order] = {}  # Not yet compared with a command
         self._driving_policy_id: str | None = None
-        self._compared: list[list[float]] = []  # Of each state, the difference of each action
+        self._compared: list[list[float]] = []  # For each state, the difference of each action
 
     def stream(self, all_heard: Iterable[Heard | None]) -> Iterator[Heard]:
         """Yield all messages and, behind each state, this policy's answer as a message of its own.
 
-        A state waits for what comes next, mostly its command: until then the machine is the driving
-        runtime's. UserError where the first state is of another task, or there was none.
+        A state waits for the next message, mostly its command, to leave the processor to the
+        driving runtime until then. UserError if the first state is of another task, or none came.
         """
-        held: list[Heard] = []  # From a state on
+        held: list[Heard] = []  # The messages since a state
         for heard in chain(all_heard, [None]):
             if heard is None or heard.topic in ("state", "command"):
                 for each in held:
@@ -137,7 +137,7 @@ class Shadow:
             raise UserError(f"there was no state to answer: {self._rejected}")
 
     def _answer(self, heard: Heard) -> Iterator[Heard]:
-        """Answer a state that the runtime would take, as if it had arrived there just now."""
+        """Answer a state that the runtime would accept, as if it arrived there just now."""
         state, arrived_s = self._policy.layout.decode(heard.payload), heard.arrived_ns * 1e-9
         if isinstance(state, State):
             state = self._latest.offer(state, arrived_s) or state
@@ -147,7 +147,7 @@ class Shadow:
         foreign = wire.is_foreign(state, self._task)
         if foreign and self._latest.accepted == 1:
             raise UserError(f"the policy is for {self._task!r}, not {state.task!r}")
-        # Round trips are by the clock of the driving runtime, which is not this one.
+        # Round trips are measured by the driving runtime's clock, not by ours.
         state = msgspec.structs.replace(state, heard_sent_ns=msgspec.UNSET)
         self._controller.begin(Received(state, arrived_s, heard.arrived_ns), arrived_s)
         output, took_ns = (None, 0) if foreign else self._infer(state)
@@ -164,24 +164,24 @@ class Shadow:
         yield Heard(key, SHADOW, payload, heard.arrived_ns, len(payload))
 
     def _infer(self, state: State) -> tuple[np.ndarray | None, int]:
-        """Return the network's action, or None, and how long it took, ns; more than T: longer."""
-        seen, found = self._policy.layout.arrays(state.observation), []
+        """Return the network's action (None if it failed or took over T), and its duration, ns."""
+        observation, results = self._policy.layout.arrays(state.observation), []
 
         def infer() -> None:
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)  # This thread's
             begun_ns, action = time.perf_counter_ns(), None
             try:
-                action = self._policy.act(seen)
+                action = self._policy.act(observation)
             except Exception as error:  # onnxruntime's exceptions share no narrower base
                 say_once(f"the policy does not answer: {error}")
-            found.append((action, time.perf_counter_ns() - begun_ns))
-            self._inferences_ms.append(found[0][1] * 1e-6)
+            results.append((action, time.perf_counter_ns() - begun_ns))
+            self._inferences_ms.append(results[0][1] * 1e-6)
 
         if self._thread is None or not self._thread.is_alive():
             self._thread = threading.Thread(target=infer, daemon=True)
             self._thread.start()
             self._thread.join(self._period_s)
-        return found[0] if found else (None, round(2e9 * self._period_s))
+        return results[0] if results else (None, round(2e9 * self._period_s))
 
     def _compare(self, command: Command | Rejection) -> None:
         if isinstance(command, Rejection):
@@ -193,7 +193,7 @@ class Shadow:
             self._compared.append([abs(ours - theirs) for ours, theirs in pairs])
 
     def report(self) -> dict[str, Any]:
-        """Return the report; None stands where there is nothing to tell a number of."""
+        """Return the report; a number without data is None."""
         names = [row.name for row in self._policy.manifest.action]
         rows: Any = np.array(self._compared).reshape(-1, len(names))
         disagreement = {}

@@ -66,7 +66,7 @@ def add_arguments(parser: cli.ArgumentParser) -> None:
 
 def run(asked: Namespace) -> int:
     if asked.loop == VEHICLE and asked.clock != REALTIME:
-        raise UserError("--loop vehicle needs --clock realtime: a vehicle waits for no simulation")
+        raise UserError("--loop vehicle needs --clock realtime: a real vehicle does not pause")
     endpoint, wait_s = asked.connect or asked.listen, asked.wait_edge_s
     tls = tls_for(asked.tls, endpoint)
     with ExitStack() as stack:
@@ -84,12 +84,12 @@ def run(asked: Namespace) -> int:
         if isinstance(clock, VehicleClock):
             port.hear("feedback", clock.receive_feedback)
             clock.wait_for_vehicle(wait_s, f"{start} --vehicle NAME")
-        found = _drive(asked, environment, port, clock, edge, rearm_command(*here))
-    write_json_out(asked.out, found)
-    print(report.summary_line(found))
-    if found["interrupted"]:
-        print(f"interrupted; it was to be {asked.episodes} episodes", file=sys.stderr)
-    return cli.INTERRUPTED if found["interrupted"] else 0
+        results = _drive(asked, environment, port, clock, edge, rearm_command(*here))
+    write_json_out(asked.out, results)
+    print(report.summary_line(results))
+    if results["interrupted"]:
+        print(f"interrupted before the end of {asked.episodes} episodes", file=sys.stderr)
+    return cli.INTERRUPTED if results["interrupted"] else 0
 
 
 def _drive(
@@ -112,7 +112,7 @@ def _drive(
         runner.rearm_command = rearm
     if not is_same:
         runner.show_task(asked.seed)
-        time.sleep(task.control_period_s)  # Its safe stop still finds this end of the wire.
+        time.sleep(task.control_period_s)  # So that its safe stop still finds our end of the wire.
         raise other_task(task)
     results: list[EpisodeResult] = []
     try:
@@ -122,7 +122,7 @@ def _drive(
                     vehicle.wait_for_standstill()
                 results.append(runner.run(episode, asked.seed + episode))
                 bar.advance({"last": results[-1].outcome})
-    except KeyboardInterrupt:  # The report is of the episodes that were driven to their end.
+    except KeyboardInterrupt:  # The report covers the episodes that were driven to their end.
         if not results:
             raise
     after, by_simulator = port.edge_status(), clock.rejected()
@@ -152,7 +152,7 @@ def other_task(task: Task) -> UserError:
 
 
 def policy_action(adapter: Adapter, decision: Decision) -> np.ndarray:
-    """Return the command's action, the safe stop's, or (before the first command) hands off."""
+    """Return the command's action, the safe stop's, or (before the first command) zero."""
     adapter.press_brake(bool(decision.brake_reason))
     if decision.brake_reason:
         return adapter.stop()
@@ -162,10 +162,10 @@ def policy_action(adapter: Adapter, decision: Decision) -> np.ndarray:
 
 
 def vehicle_action(adapter: Adapter, decision: Decision) -> np.ndarray:
-    """Return what the vehicle's actuators have reached; the safe stop without feedback.
+    """Return the action that the vehicle's actuators have reached; the safe stop without feedback.
 
-    Where the environment knows which pedal leads to the speed that the vehicle reports
-    (``pedal_for_speed``), that one is taken: errors of pedals would add up.
+    If the environment has ``pedal_for_speed``, the pedal is the one that leads to the vehicle's
+    reported speed: errors of pedals would add up.
     """
     adapter.press_brake(bool(decision.brake_reason))
     if decision.feedback is None:
@@ -185,7 +185,7 @@ class EpisodeRunner:
     environment: Environment
     clock: Clock
     publish_scene: Callable[[Any, Scene], None]
-    """Called with the environment and the fields to add to its own scene."""
+    """Called with the environment, and the fields to add to its scene."""
     task: Task
     origin: Origin
     """Sent with every scene; each episode has a seed of its own."""
@@ -198,9 +198,9 @@ class EpisodeRunner:
         self.deadline_misses = 0
 
     def show_task(self, seed: int) -> None:
-        """Send one final state, so that the edge runtime compares the task as well.
+        """Send one final state, so that the edge runtime also detects the different task.
 
-        It holds no observation: another policy's may be of another size.
+        The state holds no observation: another policy's may have another size.
         """
         self.clock.begin(0, seed)
         self.clock.finish(self._state(0, 0, None, {}, final=True))
@@ -208,8 +208,8 @@ class EpisodeRunner:
     def run(self, episode: int, seed: int) -> EpisodeResult:
         """Drive one episode to its end; the seed decides the environment and the link.
 
-        Where it is cut short (^C, a fault of the environment) a final state goes out as well: the
-        edge runtime stands by, and does not stop for a lost link.
+        If it is cut short (^C, a fault of the environment), a final state is sent, too: the edge
+        runtime goes to standby instead of stopping for a lost link.
         """
         self._under_way: State | None = None
         try:
@@ -226,8 +226,8 @@ class EpisodeRunner:
         self._adapter.last = self._adapter.hands_off
         self.origin = msgspec.structs.replace(self.origin, seed=seed)
         result = EpisodeResult(seed, "", 0.0, 0.0, 0.0, None, None, 0)
-        applied: dict[str, Any] = {}  # What the scene says of the step before
-        felt, ended, waited, waits = [], False, 0, bool(self.rearm_command)
+        applied: dict[str, Any] = {}  # The scene's fields about the last step
+        accelerations, ended, waited, waits = [], False, 0, bool(self.rearm_command)
         apply = vehicle_action if isinstance(self.clock, VehicleClock) else policy_action
         while not ended:
             state = self._state(episode, waited + result.steps, observation, info)
@@ -237,7 +237,7 @@ class EpisodeRunner:
             if decision.brake_reason == Event.OTHER_TASK.value:
                 raise other_task(self.task)
             if waits and (command := decision.command) and decision.brake_reason != NO_COMMAND:
-                # A person may take minutes: until then only the states go on.
+                # A person may take minutes: until then states go on, without steps.
                 waits = command.mode == SAFE_STOP
                 if waits:
                     if not waited:
@@ -252,7 +252,7 @@ class EpisodeRunner:
             result.steps += 1
             result.actions.append([float(value) for value in action.ravel()])
             result.reward += environments.finite("reward", reward)
-            felt.append(report.accelerations(info))
+            accelerations.append(report.accelerations(info))
             self.deadline_misses += not decision.fresh
             self.safe_stops.observe(episode, state.step, decision)
             braked = bool(decision.brake_reason)
@@ -267,7 +267,7 @@ class EpisodeRunner:
         result.distance_m = report.number_of(info, "distance_m") or 0.0
         result.time_s = round(result.steps * self._period_s, 6)
         result.lateral_acceleration_mps2, result.longitudinal_acceleration_mps2 = map(
-            of_known, zip(*felt, strict=True)
+            of_known, zip(*accelerations, strict=True)
         )
         return result
 

@@ -1,7 +1,7 @@
-"""Colours of all views, and where a view goes: window, page or file.
+"""Colours of all views, and the sink of a view: window, page or file.
 
-Window and page are rerun's viewer as a process of its own, on loopback: by itself it would bind all
-interfaces.
+Window and page are rerun's viewer in a process of its own, bound to loopback (its default is all
+interfaces).
 """
 
 from __future__ import annotations
@@ -29,27 +29,27 @@ if TYPE_CHECKING:  # rerun takes a second to load; options and checks go without
     import rerun as rr
     import rerun.blueprint as rrb
 
-# Read when rerun is imported. It has several lines for a viewer that is gone; ours says it all.
+# Read when rerun is imported. Silences its lines on a viewer that is gone: we print one.
 os.environ.setdefault("RUST_LOG", "warn,re_grpc_client=off,re_sdk=off")
 
-# Who decides what the car is told: one colour each, on light and on dark ground.
+# A colour for each source of the car's commands, for light and dark backgrounds.
 Colour = tuple[int, int, int]
 POLICY: Colour = (40, 120, 230)
 HUMAN: Colour = (60, 170, 90)
 RETURNING: Colour = (185, 140, 255)
 """The person has let go, and the action is on its way back to the policy's."""
 SHADOW: Colour = (20, 160, 150)  # A policy beside the one that drives
-APPLIED: Colour = (235, 140, 40)  # What the car was told, whoever decided it
+APPLIED: Colour = (235, 140, 40)  # The command that the car got, whoever decided it
 BY_NAME = {"policy": POLICY, "human": HUMAN, "returning": RETURNING, "applied": APPLIED}
 GROUND, ROAD, MARKING = (222, 229, 216), (92, 97, 105), (235, 235, 235)
 PATH, GOAL, GLASS = (120, 190, 255), (84, 200, 120), (30, 34, 40)
-"""Of the road from above, as people see it; the other cars have APPLIED's colour."""
+"""Of the road from above; the other cars have APPLIED's colour."""
 SPREAD = 150 / 360
-"""Of the hue: what is asked and what is reached stay apart, however many actions there are."""
+"""Range of the hues of one colour's shades: asked and achieved actions stay distinguishable."""
 
 
 def shades(colour: Colour, count: int) -> list[Colour]:
-    """Return ``count`` colours whose hues go on from ``colour``, which is the first."""
+    """Return ``count`` colours: ``colour`` first, then the following hues."""
     hue, light, saturation = colorsys.rgb_to_hls(*(part / 255 for part in colour))
     hues = (hue + SPREAD * number / count for number in range(count))
     turned = [colorsys.hls_to_rgb(each % 1.0, light, saturation) for each in hues]
@@ -57,12 +57,12 @@ def shades(colour: Colour, count: int) -> list[Colour]:
 
 
 LOOPBACK = "127.0.0.1"
-START_S = 30.0  # Until a viewer listens, at most
+START_S = 30.0  # Limit until a viewer listens
 LOOK_S = 0.05
-WRITE_S = 60.0  # Until a disk has taken what was drawn, at most
-FLUSH_S = 5.0  # Until a viewer has taken what was drawn, at most
-END_S = 1.0  # Until a viewer that takes no more has ended, at most
-FOXGLOVE_PORT = 8765  # Foxglove looks at this port first
+WRITE_S = 60.0  # Limit until a file is written
+FLUSH_S = 5.0  # Limit until a viewer has received everything
+END_S = 1.0  # Limit until a viewer that receives no more has ended
+FOXGLOVE_PORT = 8765  # Foxglove tries this port first
 SPAWN, SERVE, SUFFIX = "spawn", "serve", ".rrd"
 
 
@@ -77,7 +77,7 @@ def has_display() -> bool:
 def check_sink(sink: str | None, port: int | None = None) -> str:
     """Return the sink: spawn (also for None), serve, or an absolute path that ends in .rrd.
 
-    UserError for any other, and where nothing can be shown there, as at a ``port`` of a page.
+    UserError for any other, a missing display, a file that cannot be written, or a busy ``port``.
     """
     sink = sink or SPAWN
     if port is not None:
@@ -141,7 +141,7 @@ def _saved(recording: rr.RecordingStream, path: str, blueprint: rrb.Blueprint) -
 def _shown(
     recording: rr.RecordingStream, kind: str, blueprint: rrb.Blueprint, port: int | None
 ) -> Iterator[None]:
-    """Draw for a window or a page; ViewerGone where it does not last."""
+    """Draw for a window or a page; ViewerGone where the viewer ends or hangs."""
     page, data = (port, port + 1) if port else (free_port(), free_port())
     options, ports = ["--expect-data-soon"], [data]
     if kind == SERVE:
@@ -158,7 +158,7 @@ def _shown(
             flush(recording)
     except ViewerGone as gone:
         why = viewer.last_words(END_S)
-        viewer.end()  # Where it hangs, rerun would wait for it for ever.
+        viewer.end()  # Otherwise rerun waits for ever for a viewer that hangs.
         raise ViewerGone(why or str(gone)) from None
     finally:
         recording.disconnect()
@@ -174,7 +174,7 @@ class Viewer:
         self._said = tempfile.TemporaryFile()  # noqa: SIM115 (open for as long as the viewer writes)
         quiet: Any = {"stdout": subprocess.DEVNULL, "stderr": self._said}
         environment = {**os.environ, "RERUN_APP_ONLY": "true"}  # As rerun's own spawn: no questions
-        # A group of its own: ^C is not for it, and it ends with the child that the module starts.
+        # A process group of its own: ^C does not reach it, and `end` also kills its child.
         self._process = subprocess.Popen(command, env=environment, start_new_session=True, **quiet)
         end_s = time.monotonic() + START_S
         try:
@@ -192,7 +192,7 @@ class Viewer:
         self._process.wait()
 
     def last_words(self, wait_s: float) -> str:
-        """Return why it has ended; an empty text if it is still running after ``wait_s``."""
+        """Return why the viewer has ended, "" if it still runs after ``wait_s``."""
         try:
             self._process.wait(wait_s)
         except subprocess.TimeoutExpired:

@@ -1,6 +1,6 @@
-"""The adapter from a drive to rerun, and ``python -m bridge view``, which shows the wire by it.
+"""Draw a drive in rerun; and ``python -m bridge view``, which draws the wire.
 
-A `Canvas` draws; the functions after it lay views out, also those of ``trainer.view``. Metres; y
+A `Canvas` draws; the functions after it lay out views, also those of ``trainer.view``. Metres; y
 grows downwards, as in the scene. Cars are lines: rerun cannot turn its flat boxes.
 """
 
@@ -31,11 +31,11 @@ from edge_runtime.wire import DRIVE, Command, Feedback, Health, State
 
 RED, GREY = (220, 50, 50), (120, 124, 130)
 MARGIN_M = 8.0  # Ground shown beyond the path
-CAMERA = "camera"  # From here the road is seen
-MOST_LINES = 16  # Numbers of an observation that a plot can show
+CAMERA = "camera"  # Origin of the view from above
+MOST_LINES = 16  # Numbers of an observation that are plotted, at most
 MOST_DRAWN = 2**32  # Steps on the time axis: rerun counts its ns in 64 bits
 PICTURE_INTERVAL_S = 0.1
-"""Ten pictures a second, as many as a control period of ours makes, are plenty for an eye."""
+"""Ten pictures a second, our usual control rate, are plenty for an eye."""
 WHOLE = rrb.TimeRange(start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite())
 """The whole time axis; without it rerun scrolls the axis with the cursor."""
 
@@ -43,8 +43,8 @@ WHOLE = rrb.TimeRange(start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeB
 class Canvas:
     """Draws on a recording at the time that ``stand_at`` has set; used by one thread.
 
-    ``states``: path of each state -> the colours of its values. ``layout`` lays out the views; its
-    scene fixes the ground shown, if there is one.
+    ``states``: path of each state -> the colours of its values. ``layout`` makes the blueprint; a
+    scene fixes the ground shown.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class Canvas:
         self.log("status", rr.TextDocument(text, media_type="text/markdown"))
 
     def observation(self, entries: Mapping[str, np.ndarray]) -> None:
-        """Draw what the policy sees: its pictures, the newest last, and the first numbers."""
+        """Draw an observation: its pictures (the newest is the last), and its first numbers."""
         for name, array in entries.items():
             if (images := messages.images_of(array)) is None:
                 self.scalar(f"observation/{name}", *array.ravel()[:MOST_LINES])
@@ -92,7 +92,7 @@ class Canvas:
                 self.log(f"frames/{place}", rr.Image(image, color_model=model))
 
     def road(self, scene: SeenScene | None, picture: Any, ego_colour: Colour) -> None:
-        """Draw the road from above, or the picture in its place; lay out anew for a new ground."""
+        """Draw the road from above, or else the picture; lay out anew for a new ground."""
         ground = (scene.roads, scene.path, scene.goal) if scene else ()
         if self._ground != ground:
             self._ground = ground
@@ -129,7 +129,7 @@ def bounds_of(path: Sequence[Point]) -> list[tuple[float, float]]:
 
 
 def away_m(scene: SeenScene) -> list[float]:
-    """Return how far (x, y) the ego car is from the view's middle; [0, 0] where it is inside."""
+    """Return the view's shift (x, y) to an ego car outside of it; [0, 0] while it is inside."""
     for ego in (car for car in scene.vehicles if car.ego and scene.path):
         place = list(zip((ego.x, ego.y), bounds_of(scene.path), strict=True))
         if not all(low <= at <= high for at, (low, high) in place):
@@ -148,7 +148,7 @@ def lanes_view(origin: str, title: str) -> rrb.StateTimelineView:
 
 
 def road_view(scene: SeenScene | None) -> rrb.Spatial2DView:
-    """Make the view from above: of the scene's path, moving on with a car that leaves it."""
+    """Make the view from above of the scene's path; it follows a car that leaves it."""
     look: dict[str, Any] = {"name": "From above", "background": list(shown.GROUND)}
     if scene is None or not scene.path:
         return rrb.Spatial2DView(origin="road", **look)
@@ -158,13 +158,13 @@ def road_view(scene: SeenScene | None) -> rrb.Spatial2DView:
 
 
 def sees_view(frames: bool = True) -> rrb.Horizontal:
-    seen: list[Any] = [plot_view("observation", "Policy sees")]
+    views: list[Any] = [plot_view("observation", "Policy sees")]
     if frames:
         view = rrb.Spatial2DView
         times = {"before": "t-1", "now": "t"}.items()
-        seen = [view(origin=f"frames/{at}", name=f"Policy sees {t}") for at, t in times]
+        views = [view(origin=f"frames/{at}", name=f"Policy sees {t}") for at, t in times]
     now = rrb.TextDocumentView(origin="status", name="Now")
-    return rrb.Horizontal(*seen, now)
+    return rrb.Horizontal(*views, now)
 
 
 def two_columns(
@@ -214,11 +214,11 @@ class WireLog:
         self._frames_pace, self._cars_pace = Pace(picture_interval_s), Pace(picture_interval_s)
         self._task: Task | None = None
         self._layout: Layout | None = None
-        self._period_s = 0.0  # The control period, as soon as a message tells it
+        self._period_s = 0.0  # The control period, once a message has told it
         self._session = ""  # Of the newest state
         self._episode: tuple[str, int] | None = None  # The newest one seen
         self._starts: dict[tuple[str, int], int] = {}
-        """Session and episode -> its first step on the time axis. A viewer may come late."""
+        """Session and episode -> its first step on the time axis, for a viewer that comes late."""
         self._end_step = 0
         self._mode = self._reason = ""
         self._heard_command_ns = self._plan_periods = 0
@@ -245,7 +245,7 @@ class WireLog:
         if state.speed_mps is not None:
             self._canvas.scalar("speed/simulated", state.speed_mps)
         if self._episode != episode:
-            # For a viewer that comes late, or in a new episode, no command was due before.
+            # No command was due before, in a new episode or for a viewer that comes late.
             self._episode, self._heard_command_ns = episode, arrived_ns
         periods = BRAKE_PERIODS + self._plan_periods
         silent = arrived_ns - self._heard_command_ns > periods * self._period_s * 1e9
@@ -336,7 +336,7 @@ class WireLog:
 def run(arguments: Any, stage: Callable[[Any], Iterator[Heard]] | None = None) -> int:
     """Run the command until the simulator goes, or somebody interrupts.
 
-    ``stage`` makes what is shown of what `bridge.ports.open_source` yields.
+    ``stage`` turns the messages of `bridge.ports.open_source` into those to show.
     """
     from bridge.ports import open_source, wait_to_be_told  # zenoh: test drives go without.
 
@@ -354,7 +354,7 @@ def run(arguments: Any, stage: Callable[[Any], Iterator[Heard]] | None = None) -
             for heard in stage(all_heard) if stage else filter(None, all_heard):
                 show(heard)
             if arguments.recording and sink == shown.SERVE:
-                print("all of it is there; ^C ends", flush=True)
+                print("everything is shown; ^C ends", flush=True)
                 wait_to_be_told()
         except KeyboardInterrupt:  # The ordinary way to end a page and a live view, which is kept.
             if arguments.recording and sink != shown.SERVE:
@@ -366,18 +366,18 @@ def run(arguments: Any, stage: Callable[[Any], Iterator[Heard]] | None = None) -
 
 @contextlib.contextmanager
 def _rerun(arguments: Any, sink: str) -> Iterator[Callable[[Heard], None]]:
-    all_of_it = arguments.recording or sink.endswith(shown.SUFFIX)
+    is_complete = arguments.recording or sink.endswith(shown.SUFFIX)
     with shown.open_sink(sink, "phil_hil", lay_out(None), arguments.port) as recording:
-        log = WireLog(recording, 0.0 if all_of_it else PICTURE_INTERVAL_S)
+        log = WireLog(recording, 0.0 if is_complete else PICTURE_INTERVAL_S)
         yield log.write
     if log.left_out:
-        said = counted(log.left_out, "message")
-        print(f"left out: {said} that cannot be drawn", file=sys.stderr, flush=True)
+        count = counted(log.left_out, "message")
+        print(f"left out: {count} that cannot be drawn", file=sys.stderr, flush=True)
 
 
 @contextlib.contextmanager
 def _foxglove(arguments: Any, sink: str) -> Iterator[Callable[[Heard], None]]:
-    """Yield what shows a message in Foxglove; UserError where the port is taken."""
+    """Yield a function that shows a message in Foxglove; UserError where the port is taken."""
     from bridge.recording import ENCODING, SCHEMA_ENCODING, Schema, ViewerCopies
 
     try:
@@ -388,9 +388,9 @@ def _foxglove(arguments: Any, sink: str) -> Iterator[Callable[[Heard], None]]:
 
     @functools.cache
     def channel(topic: str, schema: Schema) -> Any:
-        told = foxglove.Schema(name=schema[0], encoding=SCHEMA_ENCODING, data=schema[1])
-        kind: Any = {"message_encoding": ENCODING, "schema": told, "context": context}
-        return foxglove.Channel(topic, **kind)
+        fields = foxglove.Schema(name=schema[0], encoding=SCHEMA_ENCODING, data=schema[1])
+        options: Any = {"message_encoding": ENCODING, "schema": fields, "context": context}
+        return foxglove.Channel(topic, **options)
 
     def add(topic: str, schema: Schema, now_ns: int, data: bytes) -> None:
         channel(topic, schema).log(data, log_time=now_ns)
