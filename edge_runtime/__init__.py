@@ -15,6 +15,6 @@ __all__ = ["drive"]
 def __getattr__(name: str) -> Any:
     if name != "drive":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from edge_runtime.run import drive  # here: to import the package loads no library
+    from edge_runtime.run import drive  # here, so that importing the package loads no library
 
     return drive

@@ -26,7 +26,7 @@ from edge_runtime.transport import check_endpoint, tls_for
 from edge_runtime.util import UserError, printable
 from edge_runtime.watch import watch
 
-_RUNS, _FEWEST_RUNS, _MOST_S = 300, 20, 10.0  # Of a policy that is slow, fewer
+_RUNS, _FEWEST_RUNS, _MOST_S = 300, 20, 10.0  # A slow policy gets fewer runs
 
 
 def _check(arguments: argparse.Namespace) -> int:
@@ -34,8 +34,8 @@ def _check(arguments: argparse.Namespace) -> int:
     check_writable(arguments.out)
     policy = load_policy(arguments.policy, arguments.public_key, arguments.allow_unsigned)
     durations_ns: List[int] = []
-    for seen in itertools.islice(itertools.cycle(probes(policy.layout)), _RUNS):
-        durations_ns.append(infer(policy, seen)[1])
+    for observation in itertools.islice(itertools.cycle(probes(policy.layout)), _RUNS):
+        durations_ns.append(infer(policy, observation)[1])
         if len(durations_ns) >= _FEWEST_RUNS and sum(durations_ns) > _MOST_S * 1e9:
             break
     inference_ms = quantiles_ms(durations_ns)
@@ -43,7 +43,7 @@ def _check(arguments: argparse.Namespace) -> int:
     if inference_ms["p99"] > limit_ms:
         took = f"its inference takes {inference_ms['p99']:.0f} ms (p99), over {limit_ms:.0f} ms"
         raise UserError(f"policy {arguments.policy} may not drive: {took}")
-    import onnxruntime  # Here: an operator's commands need none.
+    import onnxruntime  # Here, because an operator's commands do without it.
 
     report = {
         "policy_id": policy.policy_id,
@@ -100,7 +100,7 @@ def status(parser: argparse.ArgumentParser) -> None:
     _add_operator(parser)
     add = parser.add_mutually_exclusive_group().add_argument
     add("--out", metavar="FILE.json", help="write the whole status to this file")
-    text = "show once a second, until ^C, what matters beside the vehicle"
+    text = "print a short status once a second until ^C"
     add("--watch", action="store_true", help=text)
 
 
@@ -109,11 +109,11 @@ def _rearm(arguments: argparse.Namespace) -> int:
     if tls is not None:
         check_name(tls.name, common_name(OPERATOR, arguments.vehicle_id))
     answer = partial(ask, arguments.connect, arguments.vehicle_id, tls=tls)
-    stop = "none seen"  # late, a re-arm is for no other
-    with contextlib.suppress(UserError):  # the second question tells why
-        seen = answer("status")
-        newest = seen["command"] or {}
-        stop = f"{newest.get('session')}/{newest.get('episode')}/{seen['safe_stops']}"
+    stop = "none seen"  # names the stop to re-arm: a delayed re-arm must not release a later one
+    with contextlib.suppress(UserError):  # the next query reports why
+        current = answer("status")
+        newest = current["command"] or {}
+        stop = f"{newest.get('session')}/{newest.get('episode')}/{current['safe_stops']}"
     reply = answer("rearm", payload=stop)
     if not reply["accepted"]:
         raise UserError(f"{arguments.vehicle_id} was not re-armed: {reply['detail']}")
@@ -131,7 +131,7 @@ _NOT_SHOWN = ("manifest", "schema", "sent_ns", "command", "feedback")
 
 
 def render_status(status: Dict[str, Any]) -> str:
-    """Render the reply of the queryable: a line for each field, some in words."""
+    """Render a status reply, one line a field."""
     rows = {
         **{name: value for name, value in status.items() if name not in _NOT_SHOWN},
         "policy_id": f"{status['policy_id'][:12]} ({status['manifest']['task']})",
@@ -166,9 +166,9 @@ main = program(
 
 
 def script() -> None:
-    ended = run_cli(main)  # it has flushed what it printed
+    status = run_cli(main)  # which has flushed stdout
     # The interpreter's exit would wait for a thread that hangs, or that a driver left behind.
-    os._exit(ended)
+    os._exit(status)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What an operator allows a vehicle: how fast, how sharp, how far until the next re-arm. Pure."""
+"""An operator's limits for a vehicle: speed, steering, distance until the next re-arm. Pure."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ STEERING = "steering"
 
 
 class Bounds(NamedTuple):
-    """The settings of these names in [vehicle]; inf: none."""
+    """The settings of these names in [vehicle]; inf: no limit."""
 
     max_speed_mps: float = math.inf
     max_steering_rad: float = math.inf
@@ -23,10 +23,10 @@ NO_BOUNDS = Bounds()
 
 
 class Model(NamedTuple):
-    """What a vehicle can do, as far as its driver knows (inf: it does not).
+    """A vehicle's physical limits, as its driver knows them (inf: unknown).
 
-    `full_steering_rad` is the angle at the ends of `limits["steering"]`. Angles are of the wheel
-    that the driver steers by: a Hunter's inner one.
+    `full_steering_rad` is the angle at the ends of `limits["steering"]`. Angles are those of the
+    wheel that the driver commands: a Hunter's inner one.
     """
 
     max_speed_mps: float = math.inf
@@ -35,20 +35,20 @@ class Model(NamedTuple):
 
 
 def check_bounds(bounds: Bounds, model: Model, vehicle: str) -> None:
-    """Raise UserError for a cap above the model's limit, and for one that nobody could hold."""
+    """Raise UserError for a cap above the model's limit, or one that the driver cannot hold."""
     for name in ("max_speed_mps", "max_steering_rad"):
-        asked, most = getattr(bounds, name), getattr(model, name)
-        if most < asked < math.inf:
-            raise UserError(f"[vehicle] {name} {asked:g} is above the limit of {vehicle}: {most:g}")
+        cap, limit = getattr(bounds, name), getattr(model, name)
+        if limit < cap < math.inf:
+            raise UserError(f"[vehicle] {name} {cap:g} is above the limit of {vehicle}: {limit:g}")
     if bounds.max_steering_rad < math.inf and not 0.0 < model.full_steering_rad < math.inf:
         words = f"[vehicle] max_steering_rad: the driver {vehicle} does not know its angle"
         raise UserError(f"{words}; leave it out, or set the driver's `model`")
 
 
 def narrowed(limits: Limits, bounds: Bounds, model: Model) -> Limits:
-    """Cut the range of the steering to the cap, for the loop and for any driver.
+    """Cut the steering's range to the operator's cap.
 
-    The angle grows at least in proportion to the action, so none within is above the cap.
+    The angle grows at least in proportion to the action: no action within exceeds the cap.
     """
     if STEERING not in limits or not bounds.max_steering_rad < model.full_steering_rad:
         return limits
@@ -57,7 +57,7 @@ def narrowed(limits: Limits, bounds: Bounds, model: Model) -> Limits:
 
 
 class Leash:
-    """The distance since the last re-arm, by the speeds noted; both directions count."""
+    """The distance driven since the last re-arm, by the reported speeds; both directions count."""
 
     def __init__(self, length_m: float) -> None:
         self._length_m, self._gone_m = length_m, 0.0
@@ -71,13 +71,13 @@ class Leash:
         self._gone_m = 0.0
 
     def note(self, speed_mps: float, now_s: float) -> None:
-        """Take a report. In between it may have been as fast as the faster of two."""
+        """Add the distance since the last report, at the faster of the two speeds."""
         if not math.isfinite(speed_mps):
-            return  # a fault by itself; the next report counts for this one's time
+            return  # a fault by itself; the next report covers this interval, too
         faster_mps = max(abs(speed_mps), self._speed_mps)
         self._gone_m += faster_mps * max(now_s - self._noted_s, 0.0)
         self._noted_s, self._speed_mps = now_s, abs(speed_mps)
 
     def is_used(self, ahead_s: float) -> bool:
-        """Return whether it is used up, or will be within `ahead_s`."""
+        """Return whether the leash is used up, or will be within `ahead_s`."""
         return self.left_m <= self._speed_mps * ahead_s and self._length_m < math.inf

@@ -1,5 +1,5 @@
-"""What every command of the repository shares: a parser whose errors are one line and whose help
-has defaults and examples, option types with limits, exit statuses, and signals as ^C.
+"""Shared by every command: a parser with one-line errors and a help with defaults and examples,
+option types with limits, exit statuses, and signal handling.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ INTERRUPTED = 130
 BROKEN_PIPE = 141
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 ENDING_SIGNALS = (*SIGNALS, signal.SIGHUP)
-AGAIN_S = 0.3  # A second signal so soon is the same one: `timeout` signals process and group
+AGAIN_S = 0.3  # A signal repeated sooner is the same one: `timeout` signals process and group
 _LARGEST = 2**63 - 1  # as the seeds of numpy and torch must be
 
 
@@ -65,13 +65,13 @@ class ArgumentParser(argparse.ArgumentParser):
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Refuse an unknown option, with a guess, before argparse asks for one that is missing."""
-        known, given = self._option_string_actions, sys.argv[1:] if args is None else list(args)
-        for word in takewhile("--".__ne__, () if self._subparsers else given):
+        known, argv = self._option_string_actions, sys.argv[1:] if args is None else list(args)
+        for word in takewhile("--".__ne__, () if self._subparsers else argv):
             name = word.partition("=")[0]
             if name.startswith("--") and name not in known:
                 guesses = difflib.get_close_matches(name, known, 1)
                 self.error(f"there is no option {'; did you mean '.join([name, *guesses])}")
-        return super().parse_known_args(given, namespace)
+        return super().parse_known_args(argv, namespace)
 
     def error(self, message: str) -> NoReturn:
         """Print "prog: what is wrong (see prog --help)" and exit with status 2."""
@@ -98,10 +98,10 @@ class Subcommand(NamedTuple):
     run: Callable[[argparse.Namespace], int]
 
 
-def command(does: Any, *shown: str) -> Callable[[Callable[[Any], None]], Subcommand]:
-    """Decorate a function that adds options; `does` runs, or is `module:function` to load then."""
-    load = partial(_load, does) if isinstance(does, str) else lambda: does
-    return lambda add: Subcommand(examples(*shown), add, lambda given: int(load()(given)))
+def command(run: Any, *shown: str) -> Callable[[Callable[[Any], None]], Subcommand]:
+    """Decorate a function that adds options; `run`, or its lazy `module:function`, is called."""
+    load = partial(_load, run) if isinstance(run, str) else lambda: run
+    return lambda add: Subcommand(examples(*shown), add, lambda arguments: int(load()(arguments)))
 
 
 def program(
@@ -109,8 +109,8 @@ def program(
 ) -> Callable[[list[str]], int]:
     """Make the `main(argv)` that runs one of many commands. `shown` are examples for its help.
 
-    `commands` has for each name one line on what it does, and a `Subcommand`, or the place that is
-    loaded when it is asked for: `module:name` of one, or a module that is like one.
+    `commands` maps each name to a `Subcommand` and one line of help. A string in its place is
+    imported when the command is chosen: "module:name", or a module with the same attributes.
     """
 
     def main(argv: list[str]) -> int:
@@ -133,8 +133,8 @@ def program(
 
 def _load(place: str) -> Any:
     module, _, name = place.partition(":")
-    found = import_module(module)
-    return getattr(found, name) if name else found
+    loaded = import_module(module)
+    return getattr(loaded, name) if name else loaded
 
 
 def run_cli(main: Callable[[list[str]], int], argv: Optional[list[str]] = None) -> int:
@@ -147,7 +147,7 @@ def run_cli(main: Callable[[list[str]], int], argv: Optional[list[str]] = None) 
         try:
             return main(sys.argv[1:] if argv is None else argv)
         finally:
-            sys.stdout.flush()  # now: at the exit nobody could say what is wrong
+            sys.stdout.flush()  # here, where a failure is still reported
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr, flush=True)
         return INTERRUPTED
@@ -156,13 +156,13 @@ def run_cli(main: Callable[[list[str]], int], argv: Optional[list[str]] = None) 
         return BROKEN_PIPE
     except (UserError, OSError) as error:
         if isinstance(error, OSError):
-            _drop_stdout()  # it may be stdout that takes no more
+            _drop_stdout()  # stdout itself may have failed
         print(f"error: {UserError(error)}", file=sys.stderr, flush=True)
         return BAD_INPUT
 
 
 def _drop_stdout() -> None:
-    """Python flushes stdout once more at exit; give it somewhere to go."""
+    """Point stdout at /dev/null: Python flushes it once more at exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
@@ -208,12 +208,12 @@ def sigterm_as_interrupt() -> Iterator[None]:
 
 @contextlib.contextmanager
 def quit_on_signals(ask: Callable[[], Optional[bool]]) -> Iterator[None]:
-    """Let the first signal `ask` for the end; a second one, or a False answer, ends the process."""
-    asked: list[int] = []
+    """Call `ask` at the first signal; end the process at a second one, or if `ask` is False."""
+    received: list[int] = []
 
     def stop(number: int, frame: Any) -> None:
-        asked.append(number)
-        if len(asked) > 1 or ask() is False:
+        received.append(number)
+        if len(received) > 1 or ask() is False:
             undo.close()
             os.kill(os.getpid(), number)
 
@@ -228,12 +228,12 @@ def handled(numbers: Iterable[int], handler: Callable[[int, Any], None]) -> Iter
 
     A SIGHUP that is ignored stays so (nohup). Does nothing outside of the main thread.
     """
-    had_s = -math.inf
+    last_s = -math.inf
 
     def once(number: int, frame: Any) -> None:
-        nonlocal had_s
-        if (now_s := time.monotonic()) - had_s > AGAIN_S:
-            had_s = now_s
+        nonlocal last_s
+        if (now_s := time.monotonic()) - last_s > AGAIN_S:
+            last_s = now_s
             handler(number, frame)
 
     is_main = threading.current_thread() is threading.main_thread()

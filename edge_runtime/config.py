@@ -31,7 +31,7 @@ _S = TypeVar("_S", bound=msgspec.Struct)
 
 
 class RideThrough(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """[ride_through]: for how long the last plan is played while nothing newer comes; 0: off."""
+    """[ride_through]: how long the last plan is followed while no newer command comes; 0: off."""
 
     max_s: float = 0.0
 
@@ -39,8 +39,8 @@ class RideThrough(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """All settings of `run`. Relative paths start at the working directory.
 
-    The last five are [vehicle]'s: bounds (None: none), which episodes need a re-arm, and the tables
-    [vehicle.NAME], by name, which each driver checks.
+    The last five come from [vehicle]: bounds (None: no limit), which episodes need a re-arm, and
+    the tables [vehicle.NAME] by name, which each driver checks.
     """
 
     policy: Optional[str] = None
@@ -61,13 +61,13 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     @property
     def is_armed_at_start(self) -> bool:
-        """Whether a vehicle may drive at once. No start gives a new leash: only a re-arm does."""
+        """Whether a vehicle may drive at once: never with a leash, which only a re-arm renews."""
         return self.armed_at_start and self.leash_m is None
 
     @property
     def bounds(self) -> Bounds:
-        given = {name: getattr(self, name) for name in Bounds._fields}
-        return Bounds(**{name: value for name, value in given.items() if value is not None})
+        settings = {name: getattr(self, name) for name in Bounds._fields}
+        return Bounds(**{name: value for name, value in settings.items() if value is not None})
 
 
 # The settings that are flags as well: metavar and help.
@@ -115,12 +115,12 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def load_config(path: Optional[PathLike], flags: Dict[str, Any], opens_link: bool = True) -> Config:
-    """Load the file's settings; flags that are not None take their place. UserError for bad ones.
+    """Load a settings file; flags that are not None override it. Raises UserError.
 
-    `opens_link` False: TLS settings are not held against the address, for nothing is connected.
+    With `opens_link` False nothing is connected, so `tls` need not go with `connect`.
     """
-    given = {name: value for name, value in flags.items() if value is not None}
-    bus = given.pop("bus", None)
+    overrides = {name: value for name, value in flags.items() if value is not None}
+    bus = overrides.pop("bus", None)
     settings: Dict[str, Any] = {}
     if path is not None:
         tables = read_toml(path, "config file")
@@ -129,7 +129,7 @@ def load_config(path: Optional[PathLike], flags: Dict[str, Any], opens_link: boo
             _check(convert(settings, Config))
         except UserError as error:
             raise UserError(f"config file {path}: {error}") from None
-    config = _check(convert({**settings, **given}, Config))
+    config = _check(convert({**settings, **overrides}, Config))
     if not config.policy:
         raise UserError("no policy to drive: name it with --policy, or as policy in --config")
     if opens_link:
@@ -142,7 +142,7 @@ def load_config(path: Optional[PathLike], flags: Dict[str, Any], opens_link: boo
 
 
 def _split_vehicle(tables: Dict[str, Any]) -> Dict[str, Any]:
-    """`vehicle` is a driver, or a table: `driver`, rules, and a table of settings for each one."""
+    """Flatten the table [vehicle] into a driver, rules, and the settings of each driver."""
     if not isinstance(tables.get("vehicle"), dict):
         return tables
     settings = dict(tables["vehicle"])

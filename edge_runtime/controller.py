@@ -19,7 +19,7 @@ from edge_runtime.safety import Event, Mode, Safety
 from edge_runtime.util import UserError
 from edge_runtime.wire import DRIVE, MAX_PLAN, MAX_RIDE_S, SAFE_STOP, Command, State, is_foreign
 
-LATE_PERIODS = 1.2  # So late the next command counts as missing: T, and a fifth of it for jitter
+LATE_PERIODS = 1.2  # A command later than this counts as missing: T, and a fifth for jitter
 
 
 class ActionLimit(NamedTuple):
@@ -38,7 +38,7 @@ Limits = Dict[str, ActionLimit]  # by the action's name
 
 
 def shared_limits(actions: Sequence[Action], vehicle: Limits) -> Limits:
-    """Cut the manifest's ranges to the vehicle's, in the policy's order. UserError: one lacks."""
+    """Cut the manifest's ranges to the vehicle's, in the policy's order. Raises UserError."""
     limits = {}
     for row in actions:
         if vehicle and row.name not in vehicle:
@@ -73,16 +73,16 @@ def neutral_action(limits: Limits) -> List[float]:
 
 
 def stop_action(last: Sequence[float], limits: Limits) -> List[float]:
-    """Return each action's stop, or its last value where it has none, like a steering."""
+    """Return each action's stop value, or its last value where it has none (steering)."""
     pairs = zip(limits.values(), last)
     return [value if limit.stop is None else limit.stop for limit, value in pairs]
 
 
 class Ride:
-    """Makes the plan of each drive command. Where it `plays`, it keeps the newest one.
+    """Makes the plan of each drive command and, with `plays`, plays the newest one to the vehicle.
 
-    A plan asks once more for what the policy wanted, in each further period: nothing else served
-    better (docs/ride_through.md). UserError where no plan can be as long as `max_s`.
+    A plan repeats the policy's action in each further period: nothing else worked better
+    (docs/ride_through.md). Raises UserError for a `max_s` that no plan can cover.
     """
 
     def __init__(self, max_s: float, period_s: float, limits: Limits, plays: bool) -> None:
@@ -98,7 +98,7 @@ class Ride:
         self._next_s = math.inf
 
     def begin(self, wanted: List[float], action: List[float], now_s: float) -> List[List[float]]:
-        """Plan what follows the command `action`, on towards `wanted`, limited like it."""
+        """Plan the actions after the command `action`: on towards `wanted`, within its limits."""
         plan = []
         for _ in range(self.periods):
             action = limit_action(wanted, action, self._limits, self._period_s)
@@ -113,7 +113,7 @@ class Ride:
         return self._next_s if self._left else math.inf
 
     def play(self, now_s: float) -> Optional[List[float]]:
-        """Return the action that is due, None where none is. Missed ones are left out."""
+        """Return the action that is due, or None; skip those whose time has passed."""
         action = None
         while now_s >= self.due_s:
             action = self._left.pop(0)
@@ -125,7 +125,7 @@ class Ride:
 
 
 class Received(NamedTuple):
-    """An accepted state and its arrival. `follows_final`: of a final state that nobody answered."""
+    """An accepted state and its arrival. `follows_final`: it replaced an unanswered final state."""
 
     state: State
     arrived_s: float
@@ -134,9 +134,9 @@ class Received(NamedTuple):
 
     @property
     def trip_s(self) -> Optional[float]:
-        """Round trip of the newest command heard, and this state; None where nobody tells it."""
+        """Round trip of the simulator's newest command and this state; None where it is unknown."""
         heard_sent_ns, heard_ns = self.state.heard_sent_ns, self.state.heard_ns
-        # The stamps of each clock first: two of different clocks may be decades apart.
+        # Subtract stamps of the same clock: those of two clocks may be decades apart.
         if isinstance(heard_sent_ns, int) and isinstance(heard_ns, int):
             held_ns = self.state.sent_ns - heard_ns
             return (self.arrived_ns - heard_sent_ns - held_ns) * 1e-9
@@ -144,7 +144,7 @@ class Received(NamedTuple):
 
 
 class Order(NamedTuple):
-    """A command without the sender's stamps. `ridden`: of a plan, for this end's vehicle only."""
+    """A command without the sender's stamps. `ridden`: from a plan, for the own vehicle only."""
 
     answers: Received
     mode: str
@@ -172,11 +172,11 @@ class Order(NamedTuple):
 
 
 class ControllerConfig(NamedTuple):
-    """What a controller decides by.
+    """A controller's settings.
 
     `needs_rearm`: a vehicle is attached, and only an operator lets it drive after a stop; with
-    `each_episode`, in each new episode too, where the start counts for the first one. `task` is the
-    policy's, `ride_s` [ride_through] max_s.
+    `each_episode` also in each new episode, except the first after an armed start. `task` is the
+    policy's, `ride_s` is [ride_through] max_s.
     """
 
     limits: Limits
@@ -189,9 +189,9 @@ class ControllerConfig(NamedTuple):
 
 
 class Controller:
-    """One state at a time: `begin` when the policy starts on it, `finish` with its answer.
+    """Handles one state at a time: `begin` when inference starts, `finish` with its answer.
 
-    `tick` is called at `next_deadline_s` and gives the orders that time alone causes.
+    The caller calls `tick` at `next_deadline_s` for the orders that time alone causes.
     """
 
     def __init__(self, config: ControllerConfig) -> None:
@@ -226,12 +226,12 @@ class Controller:
 
     @property
     def vehicle_words(self) -> str:
-        """What is wrong with the vehicle; where that has passed, what has stopped it."""
+        """The vehicle's fault or, once that has passed, the fault that stopped it."""
         return self.vehicle_fault or self._latched_fault
 
     def begin(self, received: Received, now_s: float) -> None:
         session, arrived_s = received.state.session, received.arrived_s
-        # The gap counts even where the watchdog did not get to run within it.
+        # The gap counts even if the watchdog did not run within it.
         event = rules.classify_arrival(self.safety, session, arrived_s, self._needs_rearm)
         if event is not Event.OTHER_SESSION and self._begins_episode(received):
             event = Event.EPISODE
@@ -254,17 +254,17 @@ class Controller:
     def finish(
         self, output: Optional[np.ndarray], inference_ns: int, now_s: float
     ) -> Optional[Order]:
-        """Order what the policy answers; None where it came too late. No `output`: it failed."""
+        """Turn the policy's answer into an order; None if none is due. No `output`: it failed."""
         if self._begun_s is None or self._newest is None:
             return None
         overdue = now_s - self._begun_s > self._period_s
-        # A process that was stopped in between would drive on what the road was then.
+        # A process that was suspended in between would act on an old state.
         age_s = now_s - self._newest.arrived_s
         if overdue or age_s > self.safety.answer_s:
             return self._give_up(now_s)
         self._begun_s = None
         if not self._is_late and self._lag_s + age_s > self.safety.answer_s:
-            # Too late by now: it is not answered, and so it ends no silence.
+            # Too late by now: the state is not answered, so it does not end a silence.
             self._lag_s += age_s
             self.safety = self.safety._replace(last_fresh_s=self._fresh_before_s)
         if age_s > self._period_s:
@@ -281,7 +281,7 @@ class Controller:
         if event is Event.LATE:
             return None  # as if it had not come
         if self._newest.state.final and (self._needs_rearm or self._is_late):
-            # A vehicle that is told to drive on would do so until its own watchdog ends it.
+            # A vehicle that is told to drive on would do so until its own watchdog stops it.
             return self._stop_order(inference_ns, now_s)._replace(reason=Event.FINAL.value)
         self._driven = self._newest
         order = self._drive_order(self._newest, wanted, inference_ns, now_s)
@@ -299,10 +299,10 @@ class Controller:
         """Order what is due by time alone: a stop, its repetition, or a step of a plan."""
         if self._begun_s is not None and now_s - self._begun_s > self._period_s:
             return self._give_up(now_s)
-        was, owed = self.safety.mode, self._newest is not None and not self._stopped_late
+        was, watched = self.safety.mode, self._newest is not None and not self._stopped_late
         if self._policy_is_dead:
-            pass  # whatever else is wrong, this is why it stands
-        elif was is not Mode.STANDBY and owed and rules.is_silent(self.safety, now_s):
+            pass  # no later fault replaces this reason
+        elif was is not Mode.STANDBY and watched and rules.is_silent(self.safety, now_s):
             self._apply(Event.SILENT)
         elif self.vehicle_fault:
             self._apply(Event.VEHICLE)  # it may be over before the next state
@@ -333,9 +333,9 @@ class Controller:
         return min(due) if due else None
 
     def rearm(self, now_s: float, stop: str = "") -> str:
-        """Take an operator's permission to drive again; returns why it is refused, or "".
+        """Take an operator's permission to drive again; return why it is refused, or "".
 
-        `stop` is SESSION/EPISODE/SAFE_STOPS that the operator saw; a late one is for no other.
+        `stop` is SESSION/EPISODE/SAFE_STOPS as the operator saw it: no later stop is released.
         """
         if self.safety.mode is not Mode.SAFE_STOP:
             return f"nothing to re-arm: the mode is {self.safety.mode.value}"
@@ -349,10 +349,10 @@ class Controller:
             # Kept for later, the permission would move the vehicle when the link returns.
             arrives = "only late" if self._is_late else "no fresh"
             return f"{arrives} states arrive; re-arm when the link is back"
-        assert self._newest is not None  # else it were silent
+        assert self._newest is not None  # is_silent covers None
         now = self._newest.state
         if stop not in ("", f"{now.session}/{now.episode}/{self.safety.safe_stops}"):
-            return "this is another stop than was seen; re-arm again"
+            return "the vehicle has stopped anew since the status was read; re-arm again"
         self.leash_is_used = False
         self._apply(Event.REARM)
         self.safety = self.safety._replace(permitted_s=now_s)
@@ -365,7 +365,7 @@ class Controller:
         return self._stop_order(0, self._ordered_s)._replace(reason="runtime_ended")
 
     def _event_of(self, state: State, wanted: List[float]) -> Event:
-        """Return the event of an answer; `wanted` is empty where it has another form."""
+        """Return the event of an answer; `wanted` is empty if it failed or has a wrong shape."""
         if self._task and is_foreign(state, self._task):
             return Event.OTHER_TASK
         if not wanted:
@@ -382,7 +382,7 @@ class Controller:
         return rules.classify_fresh(self.safety, state.final, self._needs_rearm)
 
     def _begins_episode(self, received: Received) -> bool:
-        """Return whether a vehicle needs a permission for this episode; its number may repeat."""
+        """Return whether a state begins an episode that needs a re-arm; its number may repeat."""
         before, now = self._newest, received.state
         if not self.each_episode or before is None:
             return False
@@ -395,7 +395,7 @@ class Controller:
 
     @property
     def _stopped_late(self) -> bool:
-        """Whether it stands while states come late; then the lack of fresh states is no news."""
+        """Whether late states keep it stopped: the lack of fresh ones is then no new event."""
         return self._is_late and self.safety.mode is Mode.SAFE_STOP
 
     def _give_up(self, now_s: float) -> Order:
@@ -414,8 +414,8 @@ class Controller:
     def _drive_order(
         self, answers: Received, wanted: List[float], inference_ns: int, now_s: float
     ) -> Order:
-        # A simulator does for T what it is told, however fast it runs. A vehicle does it in real
-        # time; there more than T counts as T: it need not leap after a pause.
+        # A simulator applies an action for T, however fast it runs. A vehicle applies it in real
+        # time; there more than T counts as T, so that the action does not leap after a pause.
         passed_s = now_s - self._ordered_s if self._needs_rearm else self._period_s
         elapsed_s = min(max(passed_s, 0.0), self._period_s)
         self._last_action = limit_action(wanted, self._last_action, self._limits, elapsed_s)

@@ -63,7 +63,7 @@ def write_json(path: PathLike, value: Any) -> None:
 
 
 def write_json_out(path: Optional[PathLike], value: Any) -> None:
-    """Write the result of a command to `--out`; nothing where no file was asked for."""
+    """Write a command's result to its `--out` file, if it has one."""
     if path is not None:
         write_json(path, value)
 

@@ -1,7 +1,7 @@
 """`python -m edge_runtime jog`: the first moves of a vehicle whose wheels are up, one Enter each.
 
-Each of STEPS says what will move, waits for Enter, has the driver do it as the runtime would,
-measures by the vehicle's feedback, and brakes. What is not as expected ends the jog with a stop.
+Each of STEPS announces a move, waits for Enter, commands the driver as the runtime would, checks
+the vehicle's feedback, and brakes. An unexpected result ends the jog with a stop.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from edge_runtime.vehicles.base import Vehicle, VehicleReport, close_in_time
 from edge_runtime.vehicles.plausibility import OVER_CAP, OVER_CAP_MPS, PEDAL
 
 CRAWL_MPS, CRAWLS_S, STEERS_RAD = 0.2, 2.0, math.radians(5.0)
-SPEED_OFF, STEERING_OFF = 0.25, 0.4  # of what was asked: so far from it is as expected
+SPEED_OFF, STEERING_OFF = 0.25, 0.4  # tolerances, as a share of what was asked
 PEDAL_SHARE = 0.5  # of full throttle, up to the crawl
-STEERING_SHARE = 0.1  # of full lock, where the driver does not know its angle
+STEERING_SHARE = 0.1  # of full lock, if the driver does not know its angle
 STANDS_MPS = 0.04
 CONTROL_PERIOD_S, LOOK_S, HOLDS_S, SOON_S, LATER_S = 0.1, 0.02, 0.5, 1.0, 4.0
 BRAKES_S = 0.8  # a Hunter's driver locks the parking brake after 1 s
@@ -58,12 +58,12 @@ def in_words(report: VehicleReport) -> str:
     numbers = [f"{name} {value:.2f}" for name, value in report.action.items()]
     battery = [] if report.battery_v is None else [f"battery {report.battery_v:.1f} V"]
     brakes = ["brakes by itself"] if report.self_braking else []
-    told = dict.fromkeys([*report.faults, *report.standing])
-    return ", ".join([f"{report.speed_mps:.2f} m/s", *numbers, *battery, *brakes, *told])
+    reasons = dict.fromkeys([*report.faults, *report.standing])
+    return ", ".join([f"{report.speed_mps:.2f} m/s", *numbers, *battery, *brakes, *reasons])
 
 
 def bench_manifest(task: str, period_s: float) -> Manifest:
-    """Make a manifest to open a driver with, without a policy; +1 steers to the left."""
+    """Make a manifest that opens a driver without a policy; steering +1 is to the left."""
     return Manifest(
         task=task, observation={"frames": Entry(dtype="uint8", shape=[1])},
         action=[Action(name=name, low=-1.0, high=1.0) for name in (PEDAL, STEERING)],
@@ -74,10 +74,10 @@ def bench_manifest(task: str, period_s: float) -> Manifest:
 
 
 class Jog:
-    """Calls a driver within the operator's bounds and its own, and looks at each of its reports.
+    """Commands a driver within the operator's and the jog's bounds, and checks each of its reports.
 
-    `ask` shows the operator a step's name and a text, and raises where the answer is no. `left`:
-    the sign of a steering to the left. UserError: bounds above the model's.
+    `ask` shows the operator a step's name and a text, and raises if the answer is no. `left` is the
+    sign of a steering to the left. Raises UserError for bounds above the model's.
     """
 
     def __init__(
@@ -107,23 +107,23 @@ class Jog:
     def go_on(
         self, drives: Optional[bool], limit_s: float, until: Any = None, never: Condition = faults
     ) -> float:
-        """Command a crawl or a stand (None: nothing) for a time; return how long it took `until`.
+        """Command a crawl, a stand or (None) nothing until `until` holds; return the seconds taken.
 
-        Raises UserError where that does not come, and at once where the vehicle is too fast
-        or goes backwards, has used up its leash, or does what it must `never`.
+        Raises UserError if `until` does not hold within `limit_s`, and at once if the vehicle is
+        too fast, goes backwards, has used up its leash, or if `never` holds.
         """
-        begin_s, comes = self.now(), False
-        while not comes and (now_s := self.now()) - begin_s <= limit_s:
+        begin_s, holds = self.now(), False
+        while not holds and (now_s := self.now()) - begin_s <= limit_s:
             if drives is not None:
                 self.vehicle.command(self._action(drives), now_s)
-            self.last = it = self.vehicle.feedback(now_s)
-            self._leash.note(it.speed_mps, now_s)
-            is_within = -STANDS_MPS <= it.speed_mps <= self._most_mps  # NaN is not
-            if not is_within or self._leash.is_used(LOOK_S) or never(it):
+            self.last = report = self.vehicle.feedback(now_s)
+            self._leash.note(report.speed_mps, now_s)
+            is_within = -STANDS_MPS <= report.speed_mps <= self._most_mps  # NaN is not
+            if not is_within or self._leash.is_used(LOOK_S) or never(report):
                 raise UserError(self.measured())
-            comes = until is not None and until(it)
+            holds = until is not None and until(report)
             self._sleep(LOOK_S)
-        if until is not None and not comes:
+        if until is not None and not holds:
             raise UserError(f"{self.measured()}, after {limit_s:g} s")
         return float(now_s - begin_s)
 
@@ -135,7 +135,7 @@ class Jog:
         action = dict(self._still)
         if STEERING in action:
             action[STEERING] = self.steering
-        if drives:  # a driver without a cap of its own gets no more throttle at the crawl
+        if drives:  # no throttle above the crawl, for a driver without a speed cap
             action[PEDAL] = self._throttle if self.last.speed_mps < self.crawl_mps else 0.0
         return action
 
@@ -154,7 +154,7 @@ class Jog:
         self.go_on(True, LATER_S, lambda it: it.speed_mps >= (1 - SPEED_OFF) * self.crawl_mps)
 
     def stop(self) -> None:
-        """Brake; then a crawl is asked for in vain."""
+        """Brake; then check that a commanded crawl moves nothing."""
         self.vehicle.brake(self.now())
         self.go_on(None, LATER_S, stands, never=nothing)
         self._most_mps = STANDS_MPS
@@ -180,7 +180,7 @@ def _outranked(
     jog.tells(cause, crawls, limit_s)
     took_s = jog.go_on(None, BRAKES_S, stands, never=nothing)
     jog.stop()
-    jog.tells(cause, False, HOLDS_S)  # so the runtime refuses a re-arm, and the driver must, too:
+    jog.tells(cause, False, HOLDS_S)  # the runtime then refuses a re-arm, and so must the driver:
     jog.vehicle.enable(jog.now())
     jog.go_on(False, HOLDS_S, never=lambda it: not it.self_braking)
     jog.vehicle.brake(jog.now())
@@ -231,8 +231,8 @@ _WAITS = f"stops within {BRAKES_S:g} s, tells why, and refuses a re-arm until it
 _PRESS = "after Enter press the emergency stop within"
 _CRAWL = f"{1 - SPEED_OFF:.0%} to {OVER_CAP:.0%} of {CRAWL_MPS:g} m/s, or of a lower cap"
 _ANGLE = f"{1 - STEERING_OFF:.0%} to {1 + STEERING_OFF:.0%} of the angle asked, at most 5 degrees"
-# Name, what the driver needs (`Jog.has`), what moves and what the operator does, what is expected,
-# and what does it and returns what was measured; where it raises, the jog is over.
+# Name, abilities that the driver needs (`Jog.has`), what moves and what the operator does, expected
+# result, and a function that returns the measurement; its exception ends the jog.
 Step = Tuple[str, Tuple[str, ...], str, str, Callable[[Jog, str], str]]
 STEPS: Tuple[Step, ...] = (
     ("feedback", (), "nothing; the brake is released", "alive, no fault, stands", _feedback),
@@ -254,7 +254,7 @@ STEPS: Tuple[Step, ...] = (
 
 
 def walk(jog: Jog, rows: List[Dict[str, str]]) -> None:
-    """Go through the steps until one is not as expected; add a row for each, the rest too."""
+    """Run the steps until one fails; add a row for each step, also for those not tried."""
     over = ""
     for name, needs, moves, expected, do in STEPS:
         lacks = [need.replace("_", " ") for need in needs if need not in jog.has]
@@ -276,7 +276,7 @@ def walk(jog: Jog, rows: List[Dict[str, str]]) -> None:
 
 
 def ask(name: str, text: str) -> None:
-    """Wait for Enter. What was typed before the question is no answer to it."""
+    """Wait for Enter; discard what was typed before the question."""
     print(f"{name}: {text}\n    Enter: yes; q: stop", flush=True)
     if sys.stdin.isatty():
         termios.tcflush(sys.stdin, termios.TCIFLUSH)
@@ -291,7 +291,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Return 0 where all was as expected that the driver can do, else 1."""
+    """Return 0 if every step that the driver is able to do has passed, else 1."""
     out = check_writable(arguments.out)
     flags = {"policy": "none", "vehicle": arguments.vehicle, "bus": arguments.bus}
     config = load_config(arguments.config, flags, opens_link=False)
@@ -307,7 +307,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     def interrupt(number: int, frame: Any) -> None:
         nonlocal interrupted
-        if not interrupted:  # a second one must not keep it from its end
+        if not interrupted:  # a second signal must not interrupt the closing
             interrupted = True
             raise KeyboardInterrupt
 

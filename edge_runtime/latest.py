@@ -1,8 +1,8 @@
-"""Which state is the newest of the right simulator, and how late it is. Pure: time is passed in.
+"""Accept newer states of the current simulator, and measure their lag. Pure: time is passed in.
 
-Contract, section 3: a new session is taken over only when the current one has been silent for 2 T.
-Rejected is what is no newer than the last accepted state, and what is further ahead than any
-simulator can have come, unless the next state follows it.
+Contract, section 3: a new session takes over only when the current one has been silent for 2 T. A
+state is rejected if it is not newer than the last accepted one, or further ahead than a simulator
+can have come (unless the state before it leapt as far).
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from typing import Dict, NamedTuple, Optional, Tuple
 from edge_runtime.wire import Reason, Rejection, State
 
 TAKEOVER_PERIODS = 2
-MAX_SESSIONS = 10_000  # Some 6 MB; at T = 0.1 s half an hour of one take-over after the other
-# One message from far ahead would make all that follow it old. So many may be lost on the way; the
-# two rates below add what a fast simulator counts while nothing arrives.
+MAX_SESSIONS = 10_000  # About 6 MB; at T = 0.1 s half an hour of constant take-overs
+# A message from far ahead would make all later ones stale, so a leap is limited: to this many lost
+# messages, and by the two rates below to what a fast simulator counts while nothing arrives.
 MAX_SKIPPED_EPISODES = 10
 MAX_SKIPPED_STEPS = 10_000
-MAX_LOST_STEPS = 10  # From one state to the next that is heard
+MAX_LOST_STEPS = 10  # Between two states that arrive
 SKIPPED_EPISODES_PER_S = 1.0
 SKIPPED_STEPS_PER_PERIOD = 10.0
 
-DRIFT = 200e-6  # s per s: two clocks may drift apart so fast, and the least with them
+DRIFT = 200e-6  # s per s: two clocks may drift apart this fast, and the least offset with them
 
 Position = Tuple[int, int]  # (episode, step): what "newer" compares within a session
 
@@ -41,9 +41,9 @@ class LatestState:
         self.rejected: Dict[str, int] = {}
         self._session: Optional[str] = None
         self._heard_s = -math.inf
-        # Where each session stood: a delayed message of an earlier one never goes back either.
+        # The last position of each session: a delayed message of an earlier one is stale, too.
         self._lasts: Dict[str, _Last] = {}
-        # Session, episode and step of the newest that was too far ahead, since the last accepted
+        # Session, episode, step of the newest leap rejected since the last accepted state
         self._leap: Optional[Tuple[str, int, int]] = None
 
     def offer(self, state: State, now_s: float) -> Optional[Rejection]:
@@ -80,7 +80,7 @@ class LatestState:
         if refusal is None or refusal.reason is not Reason.FUTURE:
             return refusal
         leap, self._leap = self._leap, (session, state.episode, state.step)
-        # A simulator that counts in leaps goes on from where it came to.
+        # Two states in a row beyond the leap: the simulator really has come so far.
         if leap is not None and leap[:2] == (session, state.episode):
             refusal = None if 0 < state.step - leap[2] <= MAX_LOST_STEPS else refusal
         return refusal
@@ -114,19 +114,19 @@ class _Least(NamedTuple):  # of a session
 
 
 class Freshness:
-    """How late each state is, in the order of arrival, whatever the sender's clock says.
+    """Measures the lag of each state, in order of arrival, without synchronised clocks.
 
-    Arrival less the sender's stamp is the delay plus the unknown offset of two clocks. The least of
-    a session belongs to its quickest state; what another state has above it is its lag. `limit_s`
-    is the lag that is too late. So a backlog is seen that comes at the usual pace, and a delay that
-    grows.
+    Arrival minus the sender's stamp is the delay plus the unknown offset of the two clocks. Its
+    least value in a session belongs to the quickest state; the excess over it is a state's lag. A
+    lag above `limit_s` is too late. This detects a backlog that arrives at the usual pace, and a
+    delay that grows.
 
     A step of the sender's clock looks like a lag, and counts as one until there is a safe stop.
     Then the round trip of a command and the next state, which needs no offset, shows whether a
-    backlog is left. Two things cannot be told apart: a clock set ahead and a backlog of just that
-    size; a clock set back and a delay that has moved from the commands to the states. Where the
-    stamps show no lag, `limit_s` of a round trip may be the command's: else jitter both ways would
-    stop it for good.
+    backlog is left. Two cases stay ambiguous: a clock set ahead looks like a backlog of that size;
+    a clock set back looks like a delay that has moved from the commands to the states. If the
+    stamps show no lag, up to `limit_s` of a round trip is charged to the command: otherwise jitter
+    both ways would stop the vehicle for good.
     """
 
     def __init__(self, limit_s: float) -> None:
@@ -146,8 +146,8 @@ class Freshness:
         """Return the lag of a state in s, 0 for the first of its session.
 
         `sent_s` is the sender's stamp and `arrived_s` monotonic. `trip_s` is the round trip, None
-        where the sender does not say what it has heard. `stands`: in a safe stop. A final state
-        teaches nothing: a simulator sends it past the network that it injects.
+        where it is unknown. `stands`: the mode is safe stop. A final state updates nothing: a
+        simulator sends it past the network that it injects.
         """
         offset_s = arrived_s - sent_s
         known = self._leasts.get(session, _Least(arrived_s, offset_s, math.inf))
@@ -156,18 +156,18 @@ class Freshness:
         lag_s = offset_s - least_s
         if final:
             return max(lag_s, 0.0)
-        stepped = abs(lag_s) > self._limit_s  # the delay, or a clock
+        stepped = abs(lag_s) > self._limit_s  # the delay changed, or a clock was set
         knows_trip = least_trip_s < math.inf
         if trip_s is not None and trip_s < 0.0:
             trip_s = None  # a clock was set between its two readings
         if trip_s is not None and (knows_trip or not stepped):
-            # Only of the first is a lag taken off: later ones come of trips themselves.
+            # Only the first trip is reduced by the lag: later lags come from trips themselves.
             quickest_s = trip_s if knows_trip else max(trip_s - max(lag_s, 0.0), 0.0)
             least_trip_s = min(least_trip_s, quickest_s)
         if stands and trip_s is not None and knows_trip:
             least_s, lag_s = self._by_trip(offset_s, least_s, trip_s - least_trip_s)
         elif stepped and knows_trip:
-            # Where it is less, a clock was set, or the link was slow before: all is late from now.
+            # Below the least, a clock was set or the link was slow before: late from now on.
             least_s, lag_s = offset_s - abs(lag_s), abs(lag_s)
         else:
             least_s, lag_s = min(least_s, offset_s), max(lag_s, 0.0)
@@ -180,6 +180,6 @@ class Freshness:
         if offset_s - least_s < -self._limit_s:  # a clock was set ahead
             least_s = shown_s
         least_s = min(max(least_s, shown_s), offset_s)
-        # Commands lag, too: were all of the trip the state's, it would never drive over jitter.
+        # Commands lag, too: with all of the trip charged to the state, jitter would stop it.
         lag_s = offset_s - min(least_s, shown_s + self._limit_s)
         return (offset_s - lag_s if lag_s <= self._limit_s else least_s), lag_s

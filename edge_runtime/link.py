@@ -1,5 +1,5 @@
-"""The edge runtime's end of the wire: what it publishes and answers, that it is the only one, and
-how good the link is.
+"""The edge runtime's end of the wire: its messages and queries, its claim to the vehicle id, and
+the quality of the link.
 
 Besides `phil/<id>/alive` each runtime declares `phil/<id>/alive/<claim>`, because Zenoh shows
 equal tokens of two sessions as one. Of two runtimes with one vehicle id the younger claim gives
@@ -32,7 +32,7 @@ from edge_runtime.wire import Health, Message, Rejection, State, encode, key
 OpenClient = Callable[[], zenoh.Session]
 
 _POLL_S = 0.1
-# Two looks so far apart: a claim that is seen in both is no leftover of a lost connection.
+# A claim that is seen in two looks this far apart is no leftover of a lost connection.
 _FIRST_LOOKS_S = 0.3
 _LOOK_S = 1.0
 _JOIN_S = 0.5
@@ -73,7 +73,7 @@ class Link:
         rearm: Callable[[str], str],
         max_state_bytes: int,
     ) -> None:
-        """Listen to states and answer queries. Call `appear` next, when it can answer."""
+        """Subscribe to states and answer queries. Call `appear` afterwards."""
 
         def state_came(sample: zenoh.Sample) -> None:
             # One byte too many is enough to be rejected; a huge message is not copied.
@@ -86,7 +86,7 @@ class Link:
             _reply(query, msgspec.to_builtins({**msgspec.structs.asdict(health()), **about}))
 
         def rearm_asked(query: zenoh.Query) -> None:
-            # `phil/**` asks what is there: a look at everything is no permission to move.
+            # A query to a wildcard such as `phil/**` explores: it is no permission to move.
             if str(query.key_expr) != rearm_key:
                 return
             refusal = rearm(bytes(query.payload or b"").decode(errors="replace"))
@@ -101,7 +101,7 @@ class Link:
         ]
 
     def appear(self, open_client: OpenClient, stop: Callable[[], None]) -> None:
-        """Show that it is alive. Call `stop` for an elder one, or an expired certificate."""
+        """Show that it is alive; call `stop` for an elder runtime or an expired certificate."""
 
         def give_way() -> None:
             self.gave_way = True
@@ -142,10 +142,10 @@ class Link:
 
 
 def _at_once(callback: Callable[[zenoh.Sample], None]) -> Any:
-    """Let Zenoh's own thread call: no second thread to wake, and no queue of old states between.
+    """Call from Zenoh's own thread: no second thread to wake, no queue of old states in between.
 
-    The callback must be quick. A native thread that calls into Python builds a Python state for
-    each call, in tens of microseconds. One PyGILState_Ensure that is never released keeps it.
+    The callback must be quick. A native thread that calls into Python creates a thread state at
+    each call, in tens of microseconds. A PyGILState_Ensure that is never released keeps it.
     """
     thread = threading.local()
 
@@ -181,10 +181,10 @@ def taken(vehicle_id: str) -> UserError:
 
 
 class Presence:
-    """Declares the tokens, and again whenever the routers that this session sees have changed.
+    """Declares the tokens, and declares them again whenever this session's routers have changed.
 
-    Zenoh 1.5 (the board's) does not tell a router that comes later of a token declared before. It
-    may wait for the network, in a thread of its own; `give_way` is called for an elder claim.
+    Zenoh 1.5 (the board's) does not announce earlier tokens to a router that appears later. Runs in
+    a thread of its own, which may wait for the network; calls `give_way` for an elder claim.
     """
 
     def __init__(
@@ -219,8 +219,8 @@ class Presence:
         """Look for other claims; give way to an elder one that is seen for the second time."""
         pause_s = _FIRST_LOOKS_S if self._seen_before is None else _LOOK_S
         self._look_at_s = time.monotonic() + pause_s
-        found = _ask(self._open_client, f"{self._key}/*")
-        claims = {key.rsplit("/", 1)[1] for key in found} - {self.claim}
+        tokens = _ask(self._open_client, f"{self._key}/*")
+        claims = {key.rsplit("/", 1)[1] for key in tokens} - {self.claim}
         seen_twice = claims & (self._seen_before or set())
         for claim in sorted(seen_twice - self._known):
             self._known.add(claim)
@@ -238,7 +238,7 @@ class Presence:
 
     def _declare(self) -> None:
         self._take_back()
-        # Wall clock, because two boards compare it; the rest tells two of one moment apart.
+        # Wall clock, because two boards compare it; the random part breaks a tie.
         self.claim = f"{time.time_ns():016x}-{os.urandom(4).hex()}"
         self._seen_before, self._look_at_s = None, time.monotonic() + _FIRST_LOOKS_S
         for token in (self._key, f"{self._key}/{self.claim}"):
@@ -283,13 +283,13 @@ def ask(
     tls: Optional[TlsFiles] = None,
     payload: Optional[str] = None,
 ) -> Dict[str, Any]:
-    """Query a runtime's "status" or "rearm" for its JSON; UserError where none comes in 2 s."""
+    """Query a runtime's "status" or "rearm" for its JSON; UserError without an answer in 2 s."""
     selector = key(vehicle_id, topic)
     with open_session(connect=connect, mode="client", tls=tls) as session:
         for reply in session.get(selector, timeout=2.0, payload=payload):
             if reply.ok is not None:
                 return parse_json(bytes(reply.ok.payload), f"the answer of {vehicle_id}")
-    # A query without the right to it looks the same from here as a runtime that is not there.
+    # A query that access control drops looks the same from here as an absent runtime.
     hint = f", or the certificate of {tls.name} may not ask for its {topic}" if tls else ""
     raise UserError(f"no edge runtime with vehicle id {vehicle_id} is connected to {connect}{hint}")
 
@@ -297,7 +297,7 @@ def ask(
 # Delay, jitter and loss of the link, each way: shown and logged, never a reason to stop.
 #
 # Each state says when it left, how many commands the simulator has heard, which one last and when.
-# With the edge's own stamps these are NTP's four (RFC 5905, section 8):
+# With the edge's own stamps this makes NTP's four timestamps (RFC 5905, section 8):
 #
 #     up   = arrived_ns - sent_ns       = delay + offset      of a state
 #     down = heard_ns - heard_sent_ns   = delay - offset      of a command
@@ -305,24 +305,24 @@ def ask(
 # `offset` is the edge's clock less the simulator's. No delay is negative, so it lies between
 # -min(down) and min(up); its middle is wrong by at most half the least round trip (section 10).
 
-# Windows in messages: 300 follow a change of the delay in 30 s at 10 Hz, and a share of 5 % needs
-# 1,200 to be good to half a point.
+# Windows in messages: 300 follow a change of the delay in 30 s at 10 Hz; a loss of 5 % needs 1,200
+# to be measured to half a percentage point.
 TIMES, MESSAGES = 300, 1200
-KNOWN = 50  # Messages each way before anything is said
-FLOOR = 0.05  # The quantile that is the floor of the times: the least alone is luck
+KNOWN = 50  # Messages needed each way before anything is reported
+FLOOR = 0.05  # The quantile taken as the floor of the times: the minimum alone is luck
 FIELDS = ("up_ms", "down_ms", "error_ms", "up_jitter_ms", "down_jitter_ms",
           "up_lost_percent", "down_lost_percent")  # fmt: skip
-MOST_PERIODS, MOST_LOST_PERCENT = 2.0, 5.0  # Delay and loss of one way from which a link is poor
-GOOD_AGAIN = 0.8  # The share of both limits below which it no longer is
+MOST_PERIODS, MOST_LOST_PERCENT = 2.0, 5.0  # A link is poor above this delay or loss in either way
+GOOD_AGAIN = 0.8  # A poor link is good again below this share of both limits
 
 
 class _Way:
-    """One way of the link; its messages are numbered in the order of their sending."""
+    """One way of the link; its messages are numbered in sending order."""
 
     def __init__(self) -> None:
         self.times_ms: Deque[float] = deque(maxlen=TIMES)
         self.counts: Deque[Tuple[int, int]] = deque(maxlen=MESSAGES)
-        """After each message that came: how many were sent up to the newest, how many came."""
+        """After each arrival: messages sent up to the newest, messages that came."""
         self.sent = self.came = 0
         self.newest = -1
 
@@ -359,10 +359,10 @@ class LinkQuality:
         is_first = state.session != self._session
         if is_first:  # another simulator: another clock, another network
             self._begin(state.session)
-        if state.episode != self._episode:  # what was under way when one ended is no loss
+        if state.episode != self._episode:  # states under way at the end of an episode are no loss
             self._episode = state.episode
             self.up.newest = state.step - 1 if is_first else -1
-        if state.final:  # no network carries it
+        if state.final:  # the simulator sends it past the network that it injects
             return
         self.up.note(state.step)
         self.up.times_ms.append((arrived_ns - state.sent_ns) * 1e-6)
@@ -373,7 +373,7 @@ class LinkQuality:
         if not number or msgspec.UNSET in (heard, heard_ns) or heard_ns == self._heard_ns:
             return
         came, self._heard, self._heard_ns = heard - self._heard, heard, heard_ns
-        if episode != self._answered:  # what was under way when the one before ended is forgotten
+        if episode != self._answered:  # commands under way at the end of an episode are no loss
             self._answered, self.down.newest = episode, number
         elif came > 0:
             self.down.note(number, came)
@@ -394,7 +394,7 @@ class LinkQuality:
 
 
 def is_poor(link: Mapping[str, float], control_period_s: float, was_poor: bool = False) -> bool:
-    """Return whether a way has a mean delay over 2 T or loses over 5 %; unknown: as it was."""
+    """Return whether a way has a mean delay over 2 T or loses over 5 %; if unknown, `was_poor`."""
     if not link:
         return was_poor
     late = max(link["up_ms"], link["down_ms"]) / (MOST_PERIODS * control_period_s * 1e3)
@@ -403,7 +403,7 @@ def is_poor(link: Mapping[str, float], control_period_s: float, was_poor: bool =
 
 
 def link_rows(link: Mapping[str, float]) -> Dict[str, str]:
-    """Render each way for a person; that of another version, with other fields, is not known."""
+    """Render each way for a person; with the fields of another version as not known."""
     if not link.keys() >= set(FIELDS):
         return {"link": "not known yet"}
     return {

@@ -67,6 +67,6 @@ class _Formatter(logging.Formatter):
 
 def _quoted(value: Any) -> str:
     text = str(value)
-    # Other parties' words may hold what a terminal would act upon: repr writes it as escapes.
+    # Foreign text may hold characters that a terminal acts upon: repr escapes them.
     is_plain = text and text.isprintable() and not any(c in " \"'=" for c in text)
     return text if is_plain else repr(text)

@@ -34,7 +34,7 @@ _HEALTH_PERIOD_S = 1.0 / HEALTH_HZ
 _JOIN_S = 0.5
 _RETRY_S = 0.1
 _FLOOD_PERIOD_S = 1.0
-# A policy that computes so long will not end: only a new process helps.
+# A call of policy or driver that takes this long will not end: only a new process helps.
 _HUNG_S = 2.0
 
 
@@ -82,7 +82,7 @@ class ControlLoop:
         self._link.declare(self._on_state, self.health, self._rearm, limit)
 
     def run(self) -> None:
-        """Be the watchdog until `stop` is called."""
+        """Run the watchdog until `stop` is called."""
         next_health_s = time.monotonic()
         next_alive_s = next_health_s
         with self._lock:
@@ -149,8 +149,8 @@ class ControlLoop:
     def _bounds(self) -> Dict[str, Any]:
         if self._vehicle is None:
             return {}
-        found = {**self._vehicle.allowed._asdict(), "leash_left_m": self._vehicle.leash.left_m}
-        return {name: value if value < math.inf else None for name, value in found.items()}
+        bounds = {**self._vehicle.allowed._asdict(), "leash_left_m": self._vehicle.leash.left_m}
+        return {name: value if value < math.inf else None for name, value in bounds.items()}
 
     def _on_state(self, payload: bytes) -> None:
         arrived_s, arrived_ns = time.monotonic(), time.time_ns()
@@ -193,14 +193,14 @@ class ControlLoop:
             self._busy_since_s = time.monotonic()
             self._controller.begin(received, self._busy_since_s)
         layout, output, inference_ns = self._policy.layout, None, 0
-        # Nobody has looked whether the observation of a foreign task fits.
+        # The observation of a foreign task was not checked against the layout.
         if not is_foreign(received.state, layout.task_text):
-            seen = layout.arrays(received.state.observation)
-            output, inference_ns = infer(self._policy, seen)
+            observation = layout.arrays(received.state.observation)
+            output, inference_ns = infer(self._policy, observation)
         with self._lock:
             self._busy_since_s = None
             if self._stopping:
-                return False  # The farewell has been said.
+                return False  # `close` sends the last command
             self._inferences_ns.append(inference_ns)
             self._look_at_vehicle(time.monotonic())
             order = self._controller.finish(output, inference_ns, time.monotonic())
@@ -210,7 +210,7 @@ class ControlLoop:
         return True
 
     def _is_hung(self, now_s: float) -> bool:
-        """Return whether policy or driver keep or lost their thread: a new process may help."""
+        """Return whether policy or driver hangs or lost its thread: a new process may help."""
         driver_s = self._vehicle.busy_s(now_s) if self._vehicle is not None else 0.0
         policy_s = now_s - self._busy_since_s if self._busy_since_s is not None else 0.0
         return not self._worker.is_alive() or max(driver_s, policy_s) > _HUNG_S
@@ -231,7 +231,7 @@ class ControlLoop:
         with self._lock:
             now_s = time.monotonic()
             if self._vehicle is not None:
-                # A fault whose cause is over ends with `enable`; the next look shows it.
+                # `enable` ends a fault whose cause has passed, so only a standing one counts.
                 self._controller.vehicle_fault = self._vehicle.standing_fault(now_s)
             refusal = self._controller.rearm(now_s, stop)
             if not refusal and self._vehicle is not None:
@@ -246,7 +246,7 @@ class ControlLoop:
             until_s = min(until_s, due_s)
         if self._vehicle is not None and not self._controller.vehicle_fault:
             until_s = min(until_s, self._vehicle.silent_at_s)
-        # Never longer than the policy may take: so nobody need wake it when the policy starts.
+        # At most T, the limit of an inference: so its start need not wake this thread.
         pause_s = min(until_s - time.monotonic(), self._period_s)
         if pause_s > 0:
             self._timer.wait(pause_s)
@@ -260,12 +260,12 @@ class ControlLoop:
             self._link.send("command", command)
             self._link_quality.note_command(command.episode, command.sent_ns)
         if self._vehicle is not None:
-            # The end of an episode is no fault, where the next needs no re-arm; and a stop that is
-            # repeated between the re-arm and the first fresh state must not take back what the
-            # re-arm has given.
-            ends = order.reason == Event.FINAL.value and not self._controller.each_episode
-            ends = ends or self._controller.safety.rearmed
-            self._vehicle.command(command, order.answers.state.speed_mps, latch=not ends)
+            # No latch at the end of an episode, if the next one needs no re-arm; and none for a
+            # stop that is repeated between a re-arm and the first fresh state: it would undo the
+            # re-arm.
+            unlatched = order.reason == Event.FINAL.value and not self._controller.each_episode
+            unlatched = unlatched or self._controller.safety.rearmed
+            self._vehicle.command(command, order.answers.state.speed_mps, latch=not unlatched)
 
     def _log_transition(self) -> None:
         safety, waits = self._controller.safety, self._controller.waits_for_rearm
@@ -275,8 +275,8 @@ class ControlLoop:
             log.event(level, "mode", was=was_mode.value, now=now, reason=safety.reason)
             self._notifier.tell(f"STATUS={now} {safety.reason}".rstrip())
         if waits and not waited:
-            told = {"after": safety.reason, "command": self._rearm_command}
-            log.event("warning", "waits_for_rearm", **told)
+            fields = {"after": safety.reason, "command": self._rearm_command}
+            log.event("warning", "waits_for_rearm", **fields)
         self._logged = (safety.mode, safety.reason, waits)
 
     def _log_link(self, link: Dict[str, float]) -> None:
@@ -285,7 +285,7 @@ class ControlLoop:
             log.event("warning" if poor else "info", "link", poor=poor, measured=link_words(link))
 
     def _log_rejection(self, rejection: Rejection, now_s: float) -> None:
-        """Log the first of each reason, then one a second: health counts all of them."""
+        """Log one rejection a second of each reason; health counts all of them."""
         reason = rejection.reason.value
         if now_s >= self._logged_rejection_s.get(reason, -math.inf) + _FLOOD_PERIOD_S:
             self._logged_rejection_s[reason] = now_s

@@ -22,7 +22,7 @@ MIN_PERIOD_S, MAX_PERIOD_S = 0.01, 1.0
 MAX_ACTIONS = 600  # so that a command fits its 64 KiB with a plan: 11 rows of 9 bytes a number
 DTYPES = ("uint8", "int32", "int64", "float32", "bool")
 OVERHEAD_BYTES = 4096  # What a state holds besides its observation, at most
-_HEADS_BYTES = 10  # MessagePack's, of a name and its bytes, at most
+_HEADS_BYTES = 10  # MessagePack's headers of a name and its bytes, at most
 
 
 class Entry(msgspec.Struct, frozen=True, kw_only=True):
@@ -78,7 +78,7 @@ class Car(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
 
 class Task(msgspec.Struct, frozen=True, kw_only=True):
-    """What is asked of a policy. `car` is left out where the policy drives no car."""
+    """A policy's task. `car` is None if the policy drives no car."""
 
     task: str
     observation: Dict[str, Entry]
@@ -92,12 +92,12 @@ class Task(msgspec.Struct, frozen=True, kw_only=True):
 
         A text that is too long for the wire ends with a checksum of the whole text.
         """
-        seen = (
+        inputs = (
             f"{name} {entry.dtype} {'x'.join(map(str, entry.shape)) or 'number'}"
             for name, entry in sorted(self.observation.items())
         )
-        done = (f"{row.name} {row.low:g} to {row.high:g}" for row in self.action)
-        text = f"{self.task}: {', '.join((*seen, *done))}, every {self.control_period_s:g} s"
+        outputs = (f"{row.name} {row.low:g} to {row.high:g}" for row in self.action)
+        text = f"{self.task}: {', '.join((*inputs, *outputs))}, every {self.control_period_s:g} s"
         if len(text) > MAX_TEXT_CHARS:
             end = f"... {zlib.crc32(text.encode()):08x}"
             text = text[: MAX_TEXT_CHARS - len(end)] + end
@@ -117,7 +117,7 @@ class Manifest(Task, frozen=True, kw_only=True):
 
 
 def decode_manifest(text: str) -> Manifest:
-    """Decode the manifest of a policy file. Raises UserError where no policy could drive by it."""
+    """Decode and check the manifest of a policy file. Raises UserError."""
     try:
         # The schema first: another schema's fields need not fit.
         schema = msgspec.json.decode(text.encode(), type=wire.Versioned).schema
@@ -132,8 +132,8 @@ def decode_manifest(text: str) -> Manifest:
 
 
 def check_task(task: Task) -> None:
-    """Raise UserError, with the first reason, where no policy could do this task here."""
-    if not MIN_PERIOD_S <= task.control_period_s <= MAX_PERIOD_S:  # nor is NaN
+    """Raise UserError, with the first reason, for a task that this runtime cannot run."""
+    if not MIN_PERIOD_S <= task.control_period_s <= MAX_PERIOD_S:  # NaN fails, too
         within = f"it must lie in {MIN_PERIOD_S} to {MAX_PERIOD_S} s"
         raise UserError(f"the control period is {task.control_period_s} s; {within}")
     for name, entry in task.observation.items():
@@ -164,7 +164,7 @@ class _Part(NamedTuple):
 
 
 class Layout:
-    """How a state carries a task's observation. Raises UserError for one that no state can."""
+    """A task's observation as bytes in a state. Raises UserError if no state can hold it."""
 
     def __init__(self, task: Task) -> None:
         self.task_text = task.text
@@ -174,7 +174,7 @@ class Layout:
             size = math.prod(entry.shape) * dtype.itemsize
             self.parts.append(_Part(name, dtype, tuple(entry.shape), size))
         self.size = sum(part.size for part in self.parts)
-        # A few names fit into half of what there is besides; many count.
+        # A few names fit into half of the overhead; more are counted.
         names = sum(len(name.encode()) + _HEADS_BYTES for name in task.observation)
         names = max(0, names - OVERHEAD_BYTES // 2)
         self.max_payload_bytes = self.size + names + OVERHEAD_BYTES
@@ -183,14 +183,14 @@ class Layout:
             raise UserError(f"{found}; the wire carries {MAX_STATE_BYTES - OVERHEAD_BYTES} at most")
 
     def decode(self, payload: bytes) -> Union[State, Rejection]:
-        """Decode a state of this task. One of another task passes: its sender is to be told."""
+        """Decode a state. One of another task passes unchecked, so that its sender is answered."""
         state = wire.decode_state(payload, self.max_payload_bytes)
         if isinstance(state, Rejection) or wire.is_foreign(state, self.task_text):
             return state
         return self.refusal(state.observation) or state
 
     def refusal(self, observation: Mapping[str, bytes]) -> Optional[Rejection]:
-        """Say why a state's observation is not this task's; None where it is."""
+        """Return why an observation does not fit this task; None if it fits."""
         if len(observation) != len(self.parts):
             names = ", ".join(part.name for part in self.parts)
             found = f"{len(observation)} arrays, not {names}"

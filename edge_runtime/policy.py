@@ -1,9 +1,9 @@
 """A policy file: its signature, its ONNX graph, its manifest, and the network that it holds.
 
 The signature is Ed25519 over the whole file: `POLICY.onnx.sig`, 64 raw bytes; keys are PEM. Before
-onnxruntime loads the file it is read field by field, without the onnx package: anything that could
-keep weights where nobody looks, or make the run time depend on the observation, is refused. The
-manifest (manifest.py) is JSON in its metadata under MANIFEST_KEY. Contract, section 4.
+onnxruntime loads the file it is read field by field, without the onnx package: fields that could
+hide weights, or make the run time depend on the observation, are refused. The manifest
+(manifest.py) is JSON in its metadata under MANIFEST_KEY. Contract, section 4.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ MAX_IR_VERSION = 10
 MAX_POLICY_MIB = 96
 """Loading takes 90 MB and up to 3.9 times the file: that fits phil-edge.service's MemoryMax."""
 OUTPUT = "action"
-_RANGE_TOLERANCE = 1e-5  # Of an action's whole range: the last bits of a network's tanh
+_RANGE_TOLERANCE = 1e-5  # Share of an action's range: rounding of a network's tanh
 
 
 class Policy(NamedTuple):
@@ -121,15 +121,15 @@ def check_tensors(session: onnxruntime.InferenceSession, task: Task) -> None:
 
 
 def _compare(what: str, tensors: list, wanted: dict[str, tuple[str, list[int]]]) -> None:
-    """Raise UserError unless these are the tensors, each behind a batch that is 1 or open."""
-    found = {each.name: (each.type, each.shape[1:]) for each in tensors}
+    """Raise UserError unless the tensors are `wanted`, each behind a batch of 1 or any size."""
+    actual = {each.name: (each.type, each.shape[1:]) for each in tensors}
     batches = [each.shape[0] if each.shape else 0 for each in tensors]
-    if found != wanted or any(batch != 1 and isinstance(batch, int) for batch in batches):
-        asked, has = (
+    if actual != wanted or any(batch != 1 and isinstance(batch, int) for batch in batches):
+        must_be, has = (
             ", ".join(f"{name} {kind} {['batch', *shape]}" for name, (kind, shape) in each.items())
-            for each in (wanted, found)
+            for each in (wanted, actual)
         )
-        raise UserError(f"its {what} must be {asked}; it has {has or 'none'}")
+        raise UserError(f"its {what} must be {must_be}; it has {has or 'none'}")
 
 
 def policy_id_of(data: bytes) -> str:
@@ -145,9 +145,9 @@ def open_network(data: bytes) -> onnxruntime.InferenceSession:
     # One thread: so small a network gains nothing from more, and the board has other work.
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4
-    # Numbers near zero, as of a dark picture, would make a network ten times slower.
+    # Denormal numbers, as from a dark picture, would make a network ten times slower.
     options.add_session_config_entry("session.set_denormal_as_zero", "1")
-    # The format that was checked: bytes can be an ONNX file and one of onnxruntime's own format.
+    # Load the format that was checked: the same bytes may be valid in onnxruntime's own, too.
     options.add_session_config_entry("session.load_model_format", "ONNX")
     try:
         # It prints "EP Error" on stdout for some broken files; stdout belongs to our reports.
@@ -164,7 +164,7 @@ _libc.fegetenv(_flushing)
 
 @contextlib.contextmanager
 def _flushed() -> Iterator[None]:
-    """Flush numbers near zero in this block only: a process's first session does so for good."""
+    """Flush denormals to zero in this block only: a process's first session does so for good."""
     before = ctypes.create_string_buffer(64)
     _libc.fegetenv(before)
     _libc.fesetenv(_flushing)
@@ -176,7 +176,7 @@ def _flushed() -> Iterator[None]:
 
 
 def probes(layout: Layout) -> Iterator[dict[str, np.ndarray]]:
-    """Make what a policy must answer first: zeros, middling values, seeded noise, each in range."""
+    """Make the probe observations, each in range: zeros, middle values, seeded noise."""
     random = np.random.RandomState(0)
     for make in (np.zeros, lambda shape: np.full(shape, 0.5), random.random_sample):
         yield {
@@ -186,21 +186,21 @@ def probes(layout: Layout) -> Iterator[dict[str, np.ndarray]]:
 
 
 def _probe(policy: Policy) -> None:
-    for seen in probes(policy.layout):
+    for observation in probes(policy.layout):
         try:
-            action = policy.act(seen)
+            action = policy.act(observation)
         except Exception as error:  # as in open_network
             raise UserError(f"onnxruntime does not run it: {error}") from None
         check_answer(action, policy.manifest, "a probe")
     for _ in range(10):
-        policy.act(seen)
+        policy.act(observation)
 
 
 def check_answer(action: np.ndarray, task: Task, what: str) -> None:
     """Raise UserError unless the answer to `what` is finite and in the manifest's ranges."""
     for row, value in zip(task.action, action.tolist()):
         slack = _RANGE_TOLERANCE * (row.high - row.low)
-        if not row.low - slack <= value <= row.high + slack:  # nor is NaN
+        if not row.low - slack <= value <= row.high + slack:  # NaN fails, too
             found = f"{row.name} {value:.3f}, outside its manifest's {row.low} to {row.high}"
             raise UserError(f"it answers {what} with {found}")
 
@@ -242,8 +242,8 @@ def check_trust(
     """Return VERIFIED, BESIDE, UNVERIFIED or UNSIGNED, and the file of the key that verified.
 
     A signature is always verified where a key is known: `allow_unsigned` lets through only what
-    cannot be verified. Without it a key beside the policy counts for nothing, because whoever
-    brings a policy could bring it, too. Raises UserError where the policy may not drive.
+    cannot be verified. Without it a key beside the policy is ignored: whoever supplies a policy
+    could supply the key, too. Raises UserError where the policy may not drive.
     """
     signature_path = Path(f"{path}{SIGNATURE_SUFFIX}")
     if not signature_path.exists():
@@ -281,9 +281,9 @@ _KINDS: dict[str, tuple[tuple[int, ...], dict[int, str]]] = {
 _DATA_LOCATION = 14  # of a tensor: 0 is inside the file
 
 _OWN_DOMAINS = ("", "ai.onnx")
-# Refused operators: why, which inputs matter, and the names. _RANDOM: refused where one of these
-# inputs is there; _COST: where one follows from the observation, not from weights and shapes alone.
-# None: always.
+# Refused operators: reason, the inputs that matter (None: always refused), names. _RANDOM: refused
+# if one of these inputs is present; _COST: if one of them depends on the observation, not on
+# weights and shapes alone.
 _RANDOM, _COST = "answers at random", "takes as long as the observation makes it"
 _OPERATORS: tuple[tuple[str, Optional[slice], tuple[str, ...]], ...] = (
     (_RANDOM, None, ("Bernoulli", "Multinomial", "RandomNormal", "RandomNormalLike",

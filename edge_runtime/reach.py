@@ -1,4 +1,4 @@
-"""Why there is no link, the far end's certificate, and a free port: Python's own socket and ssl."""
+"""Explain a missing link, watch the far end's certificate, find a free port (socket and ssl)."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def why_no_link(endpoint: str, files: Optional[TlsFiles]) -> Tuple[bool, str]:
 def _shake_hands(plain: socket.socket, host: str, files: TlsFiles) -> None:
     with _context(files).wrap_socket(plain, server_hostname=host) as link:
         link.settimeout(_ALERT_S)
-        with contextlib.suppress(socket.timeout):  # it is silent: we are let in
+        with contextlib.suppress(socket.timeout):  # no alert: the server accepts us
             link.recv(1)
 
 
@@ -48,7 +48,7 @@ def _context(files: TlsFiles) -> ssl.SSLContext:
 
 
 class Listener:
-    """The far end of a TLS link, and until when its certificate and our own hold.
+    """The far end of a TLS link: until when its certificate and our own are valid.
 
     Zenoh closes a link whose certificate expires, and lets a new one in before the second is over.
     """
@@ -59,7 +59,7 @@ class Listener:
         self.look()
 
     def refusal(self, now_s: float) -> Optional[Rejection]:
-        """Say why states of this Unix time are not taken; None where both certificates hold."""
+        """Return why states are refused at this Unix time; None while both certificates hold."""
         if now_s >= self.own_until_s:
             return Rejection(Reason.CERTIFICATE, f"our own, of {self._files.name}, has expired")
         if now_s >= self._until_s:
@@ -67,7 +67,7 @@ class Listener:
         return None
 
     def look(self) -> None:
-        """Read the certificate that the listener shows now; one that shows none keeps its last."""
+        """Read the listener's certificate; keep the last one if the listener is not reached."""
         _, host, port = _parts(self._endpoint)
         try:
             plain = socket.create_connection((host, port), timeout=_LOOK_S)
@@ -85,7 +85,7 @@ class Listener:
 def free_endpoint(protocol: str = "tcp") -> str:
     """Return a free endpoint on loopback, and reserve it: for demos and tests."""
     probe = socket.socket()
-    probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # One may listen there all the same
+    probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a server can still listen there
     probe.bind(("127.0.0.1", 0))
     _KEPT.append(probe)
     return f"{protocol}/127.0.0.1:{probe.getsockname()[1]}"

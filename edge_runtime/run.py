@@ -39,7 +39,7 @@ add_arguments = add_run_flags
 def run(arguments: argparse.Namespace) -> int:
     flags = {name: getattr(arguments, name, None) for name in (*Config.__struct_fields__, "bus")}
     drive(config=arguments.config, **flags)
-    for number in ENDING_SIGNALS:  # a second one must not change how it has ended
+    for number in ENDING_SIGNALS:  # a second signal must not change the exit status
         signal.signal(number, signal.SIG_IGN)
     return 0
 
@@ -86,7 +86,7 @@ def drive(
 
 
 class _Runtime:
-    """Opens and connects all parts; `run` closes them. Raises UserError where one cannot be had."""
+    """Opens and connects all parts; `run` closes them. Raises UserError if one does not open."""
 
     def __init__(
         self, config: Config, vehicle: Optional[Vehicle], unbuilt: contextlib.ExitStack
@@ -99,7 +99,7 @@ class _Runtime:
             check_name(name, common_name(EDGE, config.vehicle_id))
             log.event("info", "certificate", of=name, expires=f"{expires:%Y-%m-%dT%H:%MZ}")
         if config.vehicle != NONE:
-            find_vehicle(config.vehicle)  # now: a misprint need not wait for the policy
+            find_vehicle(config.vehicle)  # first: a misspelt name fails before the policy loads
         self._policy = load_policy(str(config.policy), config.public_key, config.allow_unsigned)
         manifest = self._policy.manifest
         if config.vehicle != NONE:
@@ -107,7 +107,7 @@ class _Runtime:
             unbuilt.callback(close_in_time, vehicle)
         if vehicle is not None:
             vehicle.take_bounds(config.bounds)
-            if vehicle.allowed != config.bounds:  # nobody would hold it on its leash
+            if vehicle.allowed != config.bounds:  # the runtime would enforce no bounds
                 raise UserError(f"vehicle {vehicle.name}: its take_bounds must call Vehicle's own")
         controller = _controller(config, self._policy, vehicle)
         # Both sessions hear only what this vehicle's edge may hear.
@@ -132,12 +132,12 @@ class _Runtime:
         self._failures: List[BaseException] = []
 
     def run(self, until: Optional[threading.Event]) -> bool:
-        """Drive until it is told to stop; returns False where a thread hangs. Raises UserError."""
+        """Drive until `stop` is called; return False where a thread hangs. Raises UserError."""
         if until is not None:
             threading.Thread(target=lambda: until.wait() and self.stop(), daemon=True).start()
-        # Apart from the watchdog, which is the main thread: a reader of stdout may be stalled.
+        # A thread of its own: a stalled reader of stdout must not hold the watchdog (main thread).
         announcer = threading.Thread(target=self._announce, name="announce", daemon=True)
-        # What is loaded stays: the collector need not look at it again in the middle of a drive.
+        # Loaded objects stay: the garbage collector need not scan them in the middle of a drive.
         gc.collect()
         gc.freeze()
         try:
@@ -157,7 +157,7 @@ class _Runtime:
         return ended
 
     def _announce(self) -> None:
-        """Show that it is there, print "ready", and log what keeps states away."""
+        """Declare the liveliness tokens, print "ready", and log why no states arrive."""
         config, policy = self._config, self._policy
         try:
             self._link.appear(self._open_client, self.stop)
@@ -179,7 +179,7 @@ class _Runtime:
     def _close(self, announcer: threading.Thread) -> bool:
         """End the threads, brake and close the vehicle; returns False where one of them hangs."""
         self._over.set()
-        gc.unfreeze()  # In Python another drive may follow.
+        gc.unfreeze()  # another `drive` may follow in this process
         self._notifier.tell("STOPPING=1")
         ended = self._loop.close()
         if self._vehicle is not None:
@@ -187,7 +187,7 @@ class _Runtime:
         if announcer.ident is not None:
             announcer.join(_ANNOUNCE_S)
             ended = ended and not announcer.is_alive()
-        # A peer that was stopped holds it.
+        # A suspended peer may block it.
         ended = ends_within(_CLOSE_S, self._link.close) and ended
         health = self._loop.health()
         shown = ("accepted", "rejected", "deadline_misses", "safe_stops")

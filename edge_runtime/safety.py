@@ -41,10 +41,10 @@ class Event(str, Enum):
     PAUSED = "pause_too_long"  # a vehicle had leave to drive and did not for MAX_PAUSE_S
     OTHER_SESSION = "other_session"  # a vehicle's states come from another simulator than before
     OTHER_TASK = "other_task"  # the state is of another task than the policy
-    NOT_ARMED = "not_armed"  # a vehicle whose driver was not started as a permission to move
+    NOT_ARMED = "not_armed"  # the start was no permission for the vehicle to move
     EPISODE = "episode"  # a vehicle needs a permission for each new episode
     LEASH = "leash"  # a vehicle has gone as far as one permission lets it
-    VEHICLE = "vehicle_fault"  # it is silent, does not obey, or reports what cannot be
+    VEHICLE = "vehicle_fault"  # it is silent, does not obey, or reports the impossible
     REARM = "rearm"  # an operator allows driving again
 
 
@@ -54,9 +54,9 @@ _S, _D, _X = Mode.STANDBY, Mode.DRIVE, Mode.SAFE_STOP
 _ROWS: Dict[Event, Tuple[Mode, Mode, Mode]] = {
     Event.FRESH: (_D, _D, _X),
     Event.RECOVERED: (_D, _D, _D),
-    Event.FINAL: (_S, _S, _X),  # the end of an episode is no way around the condition
+    Event.FINAL: (_S, _S, _X),  # the end of an episode does not end a safe stop
     Event.SILENT: (_S, _X, _X),  # between two episodes nothing is due
-    Event.LATE: (_X, _D, _X),  # it is not answered: what drives is silent if no other comes in time
+    Event.LATE: (_X, _D, _X),  # it is not answered: without a fresh one a drive ends as SILENT
     Event.NOT_FINITE: (_X, _X, _X),
     Event.FAILED: (_X, _X, _X),
     Event.DEAD: (_X, _X, _X),
@@ -73,13 +73,13 @@ _ROWS: Dict[Event, Tuple[Mode, Mode, Mode]] = {
 TRANSITIONS: Dict[Tuple[Mode, Event], Mode] = {
     (before, event): after for event, row in _ROWS.items() for before, after in zip(Mode, row)
 }
-# What stops it in standby or in a drive is a fault.
+# An event that stops a standby or a drive is a fault.
 FAULTS = tuple(event for event in Event if _X in (TRANSITIONS[_S, event], TRANSITIONS[_D, event]))
 FRESH_EVENTS = (Event.FRESH, Event.RECOVERED, Event.FINAL)
 
 
 class Safety(NamedTuple):
-    """Where the machine stands. `reason` is the fault that stopped it, empty elsewhere.
+    """The state of the machine. `reason` is the fault that stopped it, empty in other modes.
 
     `last_fresh_s` and `session` are the monotonic arrival of the newest state that was not late,
     and the simulator that sent it, None before the first one. `permitted_s` is when it last drove
@@ -120,10 +120,10 @@ def classify_arrival(
     if safety.last_fresh_s is None:
         return None
     if session != safety.session:
-        # It was let in because the one before was silent for 2 T, whatever the grace says.
+        # It was accepted because the one before was silent for 2 T, even within the grace.
         return Event.OTHER_SESSION if needs_rearm else Event.SILENT
     may_drive = needs_rearm and (safety.mode is Mode.STANDBY or safety.rearmed)
-    # Not from the last state: final ones may come for hours, and nobody drives.
+    # Not since the last state: final ones may come for hours without a drive.
     since_s = arrived_s if safety.permitted_s is None else safety.permitted_s
     if may_drive and arrived_s - since_s > MAX_PAUSE_S:
         return Event.PAUSED

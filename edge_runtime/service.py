@@ -19,7 +19,7 @@ _LOOK_PERIOD_S = 2.0
 
 
 class Notifier:
-    """Tells systemd, where it runs under systemd; a message without room there is dropped."""
+    """Sends messages to systemd, if that started the process; drops one that finds no room."""
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
         self.watchdog_period_s = math.inf
@@ -61,7 +61,7 @@ def look(thermal: str = "/sys/class/thermal") -> Board:
 
 
 def peak_memory_mb() -> float:
-    """Return the most memory that this process has held; getrusage has its parent's, too."""
+    """Return the peak memory of this process; getrusage would include its parent's."""
     return int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0]) * 1024e-6
 
 

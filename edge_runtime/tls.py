@@ -1,8 +1,8 @@
-"""Certificates, private keys, and what each party may say and hear.
+"""Certificates, private keys, and each party's rights on the wire.
 
 The files are checked before a session is opened: Zenoh says only "Unable to connect". ROLES is the
-table of rights, by the certificate's common name. Zenoh filters, without a word, only in the
-process that holds the rules: the simulator or router that listens, and each edge runtime.
+table of rights, by the certificate's common name. Zenoh filters silently, and only in the process
+that holds the rules: the simulator or router that listens, and each edge runtime.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class TlsFiles(NamedTuple):
     expires: datetime.datetime  # UTC: the certificate, or its authority before it
 
     def require_valid(self, now_s: float) -> None:
-        """Raise UserError where it has expired, Unix time: Zenoh looks at the far end's only."""
+        """Raise UserError once expired (Unix time): Zenoh checks the far end's certificate only."""
         if now_s >= self.expires.timestamp():
             raise UserError(f"{self.certificate} expired at {self.expires:%Y-%m-%d %H:%M} UTC")
 
@@ -51,7 +51,7 @@ class TlsFiles(NamedTuple):
 
 def load_tls(directory: PathLike) -> TlsFiles:
     """Check the three files against one another and the clock; UserError where one is wrong."""
-    # Here: without TLS nothing pays for it, in memory and at the start.
+    # Here, so that a start without TLS saves the time and memory.
     from cryptography import x509
     from cryptography.exceptions import InvalidSignature
 
@@ -66,7 +66,7 @@ def load_tls(directory: PathLike) -> TlsFiles:
     except (ValueError, TypeError, InvalidSignature):
         raise UserError(f"{path} is no certificate that {ca_path} has issued") from None
     key = read_private_key(key_path)
-    # A group may read, not write: systemd hands a service its credentials so.
+    # The group may read it: systemd passes credentials to a service like this.
     if key_path.stat().st_mode & 0o027:
         raise UserError(f"private key {key_path} is open to others; close it: chmod 600 {key_path}")
     if key.public_key() != certificate.public_key():
@@ -149,7 +149,7 @@ ROLES: Dict[str, Rights] = {
     ROUTER: Rights(all_vehicles=True, listens=True),
 }
 
-# For each right: what comes from its owner, and what goes to it in return.
+# For each right: Zenoh's messages from its owner, and those to it in return.
 _MESSAGES: Dict[str, Tuple[List[str], List[str]]] = {
     "publishes": (["put"], ["declare_subscriber"]),
     "reads": (["declare_subscriber"], ["put"]),
@@ -168,16 +168,16 @@ def common_name(role: str, vehicle_id: Optional[str] = None) -> str:
 
 
 def check_name(name: str, *able: str) -> None:
-    """Raise UserError where a certificate's name may not do this: Zenoh would say nothing."""
+    """Raise UserError unless the certificate's name is one of `able`: Zenoh would drop silently."""
     if name not in able:
         right = f"name the directory of {' or '.join(able)}"
         raise UserError(f"--tls names the certificate of {name}; {right}")
 
 
 def rules_for_simulator(tls: TlsFiles, vehicle_id: str, listens: bool) -> Dict[str, Any]:
-    """Make the rules of a simulator's end that listens; UserError for another party's certificate.
+    """Make the rules of a simulator's end; UserError for another party's certificate.
 
-    One that listens may have the router's: it is one.
+    A simulator that listens may use the router's certificate.
     """
     able = (ROUTER,) if listens else ()
     check_name(tls.name, common_name(SIMULATOR, vehicle_id), *able)
@@ -196,7 +196,7 @@ def rules_for_listener(vehicle_ids: Sequence[str]) -> Dict[str, Any]:
 
 def rules_for_edge(vehicle_id: str) -> Dict[str, Any]:
     """Make an edge runtime's `access_control`: no other vehicle's simulator may pose as its own."""
-    # The edge's own rules, as it applies them itself: what it may send leaves here.
+    # The edge applies its own rights at its own end, where what it sends is egress.
     rules = _rules(ROLES[EDGE], vehicle_id, from_it="egress", to_it="ingress")
     return _access_control({common_name(SIMULATOR, vehicle_id): rules, ROUTER: rules})
 

@@ -1,7 +1,7 @@
 """Zenoh sessions with explicit endpoints: no scouting, no gossip, quick to notice a lost peer.
 
 The simulator is a `router` that listens, the edge runtime a `peer` that connects and goes on
-trying, and viewers and operators' commands are `client`s that fail at once with nobody there.
+trying, and viewers and operators' commands are `client`s that fail at once if nobody listens.
 Behind a router of its own the simulator is a `client`, too: two peers would not hear each other.
 """
 
@@ -28,7 +28,7 @@ DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
 # At Zenoh's default lease a peer that was stopped, or whose cable was cut, lives on for 10 s.
 LEASE_MS = 1000
-# Back within 1 s of a link's return leaves 0.5 s for this: five fresh states take the rest.
+# To drive 1 s after a link's return leaves 0.5 s to reconnect: five fresh states take the rest.
 RETRY = {"period_init_ms": 100, "period_max_ms": 200, "period_increase_factor": 1.5}
 RETRY_S = 0.1
 
@@ -75,11 +75,11 @@ def open_session(
 
     `mode` is "router", "peer" or "client"; `access` is Zenoh's `access_control`, of tls.py. Raises
     UserError for a malformed endpoint, one that does not go with `tls`, a busy port, and, in client
-    mode, nobody there who gives a link.
+    mode, if no link comes about.
     """
     listens = [listen] if isinstance(listen, str) else list(listen or [])
     if listens and tls is not None and access is None:
-        raise ValueError("a TLS listener needs access control: any certificate could say all")
+        raise ValueError("a TLS listener needs access control: else any certificate has all rights")
     for endpoint in [*listens, *([] if connect is None else [connect])]:
         check_fits(check_endpoint(endpoint), tls is not None)
     config = zenoh.Config()
@@ -97,7 +97,7 @@ def open_session(
         first = "start the simulator or router there first, or name another address with --connect"
         raise UserError(f"no {link}{why and f' ({why})'}; {first}") from None
     if connect is not None and tls is not None and not session.info.routers_zid():
-        # A peer goes on trying for ever, also where it will never be let in: say so now.
+        # A peer retries for ever, even if its certificate is refused: report that now.
         answers, why = why_no_link(connect, tls)
         if answers and why and not session.info.routers_zid():
             session.close()
@@ -117,18 +117,18 @@ def _settings(
         "connect/retry": RETRY,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
-        # Nobody is scouted for, so there is nothing to wait for: half a second at every start.
+        # Without scouting there is nothing to wait for; the default costs 0.5 s at every start.
         "scouting/delay": 0,
         "transport/link/tx/lease": LEASE_MS,
         # It would map 17 MB for messages of 7 KB, and share them with any local process.
         "transport/shared_memory/enabled": False,
     }
     if mode == "router":
-        # Zenoh's most. At its 2 a recorder that gets no processor for a moment loses commands.
+        # Zenoh's maximum. At its default, 2, a recorder that loses the CPU briefly loses commands.
         rows["transport/link/tx/queue/size/real_time"] = 16
     if tls is not None:
         rows["transport/link/tls"] = tls.zenoh_rows()
-        # A port that speaks TLS only, whatever an endpoint's metadata may ask for.
+        # The port speaks TLS only, whatever an endpoint's metadata asks for.
         rows["transport/link/protocols"] = ["tls"]
     if access is not None:
         rows["access_control"] = access
@@ -148,7 +148,7 @@ def connect_client(endpoint: str, wait_s: float, tls: Optional[TlsFiles] = None)
 
 
 def only_own(own: str, hear: Callable[[zenoh.Sample], None]) -> Callable[[zenoh.Sample], None]:
-    """Make a callback that drops what was put to `phil/*/state` and the like, not to this key."""
+    """Make a callback that drops samples put to a wildcard key, such as `phil/*/state`."""
 
     def take(sample: zenoh.Sample) -> None:
         if str(sample.key_expr) == own:
@@ -181,7 +181,7 @@ class SimulatorEnd:
         self._declared.append(self._zenoh.declare_subscriber(own, take))
 
     def publish_state(self, payload: bytes) -> None:
-        """Send an encoded state to the edge runtime (and to viewers); UserError once expired."""
+        """Send an encoded state to edge and viewers; UserError once our certificate has expired."""
         if self._tls is not None:
             self._tls.require_valid(time.time())
         self._states.put(payload)
@@ -206,8 +206,8 @@ def open_simulator(
 ) -> Iterator[_End]:
     """Listen at `listen` for the edge runtime, or share the router at `connect` with others.
 
-    With `tls`, every other party has the rights of its certificate's name and no more, by the
-    listener or router. UserError if the port is busy, or if no router answers within `wait_s`.
+    With `tls`, the listener or router limits every party to the rights of its certificate's name.
+    UserError if the port is busy, or if no router answers within `wait_s`.
     """
     rules = None if tls is None else rules_for_simulator(tls, vehicle_id, connect is None)
     # Behind a router a client: two peers there would not hear one another.
@@ -222,18 +222,18 @@ def open_simulator(
 def pasted(
     words: str, role: str, endpoint: str, vehicle_id: str, tls: Optional[TlsFiles] = None
 ) -> str:
-    """Return a command for another shell of this machine, as that role.
+    """Return the command line for `role` in another shell of this machine.
 
-    Loopback stands for an endpoint that listens at every address; over TLS Zenoh connects to no
-    `[::1]`. Certificates lie beside `tls`, our own, or else where `deploy certs` makes them.
+    Loopback replaces an address that means every interface; over TLS Zenoh cannot connect to
+    `[::1]`. The certificate is taken from beside our own (`tls`), else from `deploy certs`' folder.
     """
     place = endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/localhost:")
-    given = ["--connect", place, "--vehicle-id", vehicle_id]
+    options = ["--connect", place, "--vehicle-id", vehicle_id]
     if tls is not None:
         name = common_name(role, vehicle_id)
         beside = Path(tls.certificate).parent.with_name(name)
-        given += ["--tls", str(beside) if beside.is_dir() else f"certs/{name}"]
-    return f"python -m edge_runtime {words} {' '.join(map(shlex.quote, given))}"
+        options += ["--tls", str(beside) if beside.is_dir() else f"certs/{name}"]
+    return f"python -m edge_runtime {words} {' '.join(map(shlex.quote, options))}"
 
 
 rearm_command = partial(pasted, "rearm", OPERATOR)

@@ -1,5 +1,5 @@
-"""What every part of the repository shares, with the standard library alone: the error that a user
-meets, text for a terminal, and files to read.
+"""Shared by every part of the repository, with the standard library alone: UserError, text for a
+terminal, and reading files.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class UserError(Exception):
 
 
 def name_in_file(name: str, said: str, option: str) -> str:
-    """Return what a file names to load. UserError for `module:thing`: a person must type that."""
+    """Return a name that a file holds. UserError for `module:thing`, which a person must type."""
     if ":" in name:
         rule = f"a module is imported only when it is typed: give {option} {shlex.quote(name)}"
         raise UserError(f"{said} {name}: {rule}")

@@ -1,4 +1,4 @@
-"""`status --watch`: what matters to the person beside the vehicle, for the terminal of a phone."""
+"""`status --watch`: a short status for the person beside the vehicle, on a phone's terminal."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Status = Mapping[str, Any]  # the reply of the queryable
 
 
 def watch(look: Callable[[], Status], first: Status) -> None:
-    """Print the status once a second until ^C; a runtime that is gone is waited for."""
+    """Print the status once a second until ^C, also while the runtime does not answer."""
     lines, clear = render(first), "\x1b[H\x1b[2J" if sys.stdout.isatty() else ""
     while True:
         next_s = time.monotonic() + _PERIOD_S
@@ -28,26 +28,26 @@ def watch(look: Callable[[], Status], first: Status) -> None:
 
 
 def render(status: Status) -> List[str]:
-    """Return a line for each thing; apart from faults at most 50 characters wide."""
-    told, command = (status.get(topic) or {} for topic in ("feedback", "command"))
+    """Render the status as lines of at most 50 characters; only faults may be longer."""
+    feedback, command = (status.get(topic) or {} for topic in ("feedback", "command"))
     names = [row["name"] for row in status["manifest"]["action"]]
-    speed = f"{_number(told.get('speed_mps'), 'm/s')} of {_number(told.get('commanded_speed_mps'))}"
+    speeds = feedback.get("speed_mps"), feedback.get("commanded_speed_mps")
     rows = {
         "vehicle": f"{status['vehicle_id']} ({status['vehicle']})",
         "mode": f"{status['mode']} {status['reason']}",
         "moved by": _who(status),
-        "fault": ", ".join(told.get("faults", ())) or status["vehicle_fault"] or "none",
+        "fault": ", ".join(feedback.get("faults", ())) or status["vehicle_fault"] or "none",
         "asked": _actions(names, command.get("action")),
-        "achieved": _actions(names, told.get("action")),
-        "speed": speed,
+        "achieved": _actions(names, feedback.get("action")),
+        "speed": f"{_number(speeds[0], 'm/s')} of {_number(speeds[1])}",
         "cap": f"{_number(status.get('max_speed_mps'), 'm/s')},"
         f" {_number(status.get('max_steering_rad'), 'rad')}",
         "leash": f"{_number(status.get('leash_left_m'), 'm')} of {_number(status.get('leash_m'))}",
-        "battery": _number(told.get("battery_v"), "V"),
+        "battery": _number(feedback.get("battery_v"), "V"),
         "board": _number(status.get("temperature_c"), "C"),
         **link_rows(status.get("link", {})),
     }
-    age_s = (status["sent_ns"] - told.get("sent_ns", status["sent_ns"])) * 1e-9
+    age_s = (status["sent_ns"] - feedback.get("sent_ns", status["sent_ns"])) * 1e-9
     if age_s > _OLD_S:
         rows["achieved"] = rows["speed"] = f"not heard for {age_s:.0f} s"
     return [f"{name:<9} {value}" for name, value in rows.items()]

@@ -79,11 +79,11 @@ class Rejection(NamedTuple):
 
 
 class State(msgspec.Struct, frozen=True, kw_only=True):
-    """What the simulator sees at one step. `observation` holds each array's bytes, in C order.
+    """The simulator's state at one step. `observation` holds each array's bytes, in C order.
 
     `speed_mps` is None where the environment has none. `task` is `manifest.Task.text`, left out
-    where unknown. `heard` counts the commands that came, without copies; the last is stamped
-    `heard_sent_ns`, and came at `heard_ns` by the sender's clock.
+    where unknown. `heard` counts the distinct commands received; the last was sent at
+    `heard_sent_ns` by the edge's clock, and received at `heard_ns` by the simulator's.
     """
 
     session: str
@@ -123,11 +123,11 @@ class Command(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Feedback(msgspec.Struct, frozen=True, kw_only=True):
-    """What the vehicle does. `action` is what the actuators have reached, not what was asked.
+    """The vehicle's report. `action` is what the actuators have reached, not what was asked.
 
     `episode` and `step` are those of the last command taken (-1 before the first). `speed_mps` and
-    `commanded_speed_mps`, what it is asked for now, are its own; `scenario_speed_mps` is that of
-    the scenario's car. What the driver does not know is None.
+    `commanded_speed_mps` (asked of it now) are its own; `scenario_speed_mps` is its speed as the
+    scenario's car. Values that the driver does not know are None.
     """
 
     vehicle: str
@@ -153,7 +153,7 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
     and max over the last 1,024. `superseded` counts accepted states that the policy never took,
     `rivals` other runtimes with this vehicle id. `temperature_c` is the board's hottest sensor.
     `vehicle_fault` says what is wrong with the vehicle, or what has stopped it. `link` is
-    `LinkQuality.measured`. The operator's bounds follow. What is not known, or not set, is None.
+    `LinkQuality.measured`. The operator's bounds follow. Values not known, or not set, are None.
     """
 
     vehicle_id: str
@@ -220,7 +220,7 @@ def is_foreign(state: State, task: str) -> bool:
 def decode_command(payload: bytes) -> Union[Command, Rejection]:
     """Decode a Command of a known mode with finite numbers.
 
-    To drive takes at least one action, and a plan of as many. A stop needs none, and has no plan.
+    A drive command needs an action, and plan rows of its length. The plan of a stop is dropped.
     """
     command = _decode(payload, Command)
     if isinstance(command, Rejection):

@@ -1,4 +1,4 @@
-"""The door of every vehicle: by name, as an entry point of another package, or as module:Class.
+"""Find and open a vehicle's driver: by name, as another package's entry point, or as module:Class.
 
 Only the chosen driver's module is imported.
 """
@@ -25,7 +25,7 @@ Tables = Mapping[str, Mapping[str, Any]]  # [vehicle.NAME] of the settings, by n
 
 
 def make_vehicle(name: str, tables: Tables, manifest: Manifest) -> Vehicle:
-    """Open the driver of a name for a policy; UserError where that fails. Nothing is sent."""
+    """Open the named driver for a policy, without sending anything; UserError where that fails."""
     kind, settings = _find(name, tables)
     vehicle = _call(name, kind.open, settings, manifest)
     check_driver(vehicle)
@@ -33,7 +33,7 @@ def make_vehicle(name: str, tables: Tables, manifest: Manifest) -> Vehicle:
 
 
 def check_driver(vehicle: Any) -> None:
-    """Raise UserError for what is no driver, and, closed, for one without proper `limits`."""
+    """Raise UserError for what is no driver; for one with invalid `limits`, close it and raise."""
     if not isinstance(vehicle, Vehicle):
         raise UserError(f"vehicle {vehicle!r} is no edge_runtime.vehicles.base.Vehicle")
     try:
@@ -56,7 +56,7 @@ def vehicle_limits(
 
 
 def _checked(name: str, limits: Any) -> Limits:
-    """Return the limits. Raises UserError for what a comparison would let through, or fail on."""
+    """Return the limits if they are a table of finite, ordered ranges, else raise UserError."""
     with contextlib.suppress(AttributeError, TypeError):
         rows = limits.values()
         within = (-math.inf < row.low <= row.high < math.inf and row.slew_per_s > 0 for row in rows)
@@ -67,10 +67,10 @@ def _checked(name: str, limits: Any) -> Limits:
     raise UserError(f"vehicle {name}: its limits must be like {form}, not {limits!r}")
 
 
-def _call(what: str, door: Callable[..., _Made], *arguments: Any) -> _Made:
-    """Call what a stranger wrote: it raises what its library raises, or exits."""
+def _call(what: str, function: Callable[..., _Made], *arguments: Any) -> _Made:
+    """Call a driver's code, which may raise anything or exit; UserError then."""
     try:
-        return door(*arguments)
+        return function(*arguments)
     except UserError:
         raise
     except BaseException as error:
@@ -82,7 +82,7 @@ def find_vehicle(name: str) -> Type[Vehicle]:
     """Return the class of a driver. Raises UserError if it is no Vehicle, or cannot be loaded."""
     place = name if ":" in name else BUILT_IN.get(name)
     if place is None:
-        others = {point.name: point.value for point in _others()}
+        others = {point.name: point.value for point in _entry_points()}
         if (place := others.get(name)) is None:
             known = ", ".join((NONE, *BUILT_IN, *sorted(others)))
             words = f"vehicle {name!r} is not known; choose from {known}, or a module:Class"
@@ -95,19 +95,19 @@ def find_vehicle(name: str) -> Type[Vehicle]:
 
 
 def _find(name: str, tables: Tables) -> Tuple[Type[Vehicle], Mapping[str, Any]]:
-    """Return the class, and its table: by its name here, or a module:Class by its own name.
+    """Return a driver's class and settings; a module:Class has the table of its own `name`.
 
-    Raises UserError where another looks like it: a misspelt speed cap would stay at its default.
+    Raises UserError for a table with a similar name: a misspelt table would have no effect.
     """
     kind = find_vehicle(name)
     own = kind.name if ":" in name else name
-    others = {own, kind.name, *BUILT_IN, *(point.name for point in _others())}
+    others = {own, kind.name, *BUILT_IN, *(point.name for point in _entry_points())}
     for table in difflib.get_close_matches(own, tables.keys() - others):
         raise UserError(f"[vehicle.{table}] is no table of {name}; did you mean [vehicle.{own}]?")
     return kind, tables.get(own, {})
 
 
-def _others() -> Iterable[Any]:
-    found: Any = entry_points()
-    # Before Python 3.10 a dict of lists; two folders on the path may both name one.
-    return found.select(group=GROUP) if hasattr(found, "select") else found.get(GROUP, ())
+def _entry_points() -> Iterable[Any]:
+    points: Any = entry_points()
+    # A dict of lists before Python 3.10. Two folders on the path may both name a driver.
+    return points.select(group=GROUP) if hasattr(points, "select") else points.get(GROUP, ())

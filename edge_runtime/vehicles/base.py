@@ -1,7 +1,7 @@
 """The contract of a vehicle driver, and the thread that runs one.
 
-One thread at a time calls a driver, and passes it the time in monotonic seconds. It is apart from
-the control loop: each of the two goes on, and stops the vehicle, when the other hangs.
+One thread at a time calls a driver, and passes it the time in monotonic seconds. This thread is
+not the control loop's: if either hangs, the other still stops the vehicle.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from edge_runtime.wire import FEEDBACK_HZ, MAX_TEXT_CHARS, SAFE_STOP, Command, F
 class Vehicle(abc.ABC):
     """A vehicle under command. `limits` is keyed by the action names of the manifest, in its units.
 
-    `name` is what others see, and the table in the settings; by default the class's own name. The
-    runtime sets `control_period_s` to the policy's before `enable`. A driver drives no faster than
-    `allowed.max_speed_mps`; the runtime stops one that does, and sees to the other bounds.
+    `name` is shown to others and names the table in the settings; by default the class's name. The
+    runtime sets `control_period_s` to the policy's before `enable`. A driver must drive no faster
+    than `allowed.max_speed_mps`, or the runtime stops it; the runtime holds the other bounds.
 
-    For `jog`: `outranked_by` has what its reports' `standing` says of a "remote_control" and an
-    "emergency_stop", where they tell; `steers_at_a_stand` is False where they then tell no angle.
+    For `jog`: `outranked_by` maps "remote_control" and "emergency_stop" to their words in a
+    report's `standing`; `steers_at_a_stand` is False if reports have no angle at a stand.
     """
 
     name: ClassVar[str]
@@ -47,7 +47,7 @@ class Vehicle(abc.ABC):
 
     @classmethod
     def open(cls, settings: Mapping[str, Any], manifest: Manifest) -> Vehicle:
-        """Make the driver for a policy; send nothing. By default its table are the arguments.
+        """Make the driver for a policy; send nothing. By default the settings are its arguments.
 
         Raises UserError for settings that are not valid, and where a port cannot be opened.
         """
@@ -64,15 +64,15 @@ class Vehicle(abc.ABC):
         return narrowed(self.limits, self.allowed, self.model_limits)
 
     def take_bounds(self, bounds: Bounds) -> None:
-        """Take the operator's bounds, before `enable`. UserError where the model's are below."""
+        """Take the operator's bounds, before `enable`. UserError for one above the model's."""
         check_bounds(bounds, self.model_limits, self.name)
         self.allowed = bounds
 
     @abc.abstractmethod
     def enable(self, now_s: float) -> None:
-        """Take control, at the start and at each re-arm; what stopped it is forgotten. Never waits.
+        """Take control, at the start and at each re-arm; forget the last stop. Must not block.
 
-        The vehicle stands until it confirms, which `feedback` tells, and until the first command.
+        The vehicle stands until it confirms (in `feedback`), and until the first command.
         """
 
     @abc.abstractmethod
@@ -109,7 +109,7 @@ class Vehicle(abc.ABC):
         """Brake, give control back and free what the driver holds. Safe to call twice."""
 
 
-_LEAVE_S = 3.0  # a Hunter that is to stand and give control back takes half of it
+_LEAVE_S = 3.0  # a Hunter takes half of it to stop and give control back
 
 
 def close_in_time(vehicle: Vehicle) -> None:
@@ -134,7 +134,7 @@ class _Order(NamedTuple):
 
 
 class VehicleRunner:
-    """Owns the vehicle: its own thread alone calls it. Only `start` and `close` wait for that.
+    """Calls the vehicle from a thread of its own. Only `start` and `close` wait for that thread.
 
     `action_names` are the policy's, in the order of a command's action.
     """
@@ -151,7 +151,7 @@ class VehicleRunner:
         self._watch = VehicleWatch(
             vehicle.control_period_s, vehicle.limits, vehicle.allowed.max_speed_mps
         )
-        # As often as the topic says, and twice before silence would be a fault.
+        # At the topic's rate, and at least twice before silence is a fault.
         self._period_s = min(1.0 / FEEDBACK_HZ, vehicle.control_period_s / 2)
         self._refuses = self._fails = False  # the driver raised at the newest command, report
         self._not_enabled = ""  # why the newest `enable` failed
@@ -170,7 +170,7 @@ class VehicleRunner:
 
     @property
     def leash_is_used(self) -> bool:
-        """Whether it has gone as far as it may, or will have before it is heard again."""
+        """Whether the leash is used up, or will be before the next report."""
         return not self._enable_due and self.leash.is_used(self._period_s)
 
     def busy_s(self, now_s: float) -> float:
@@ -187,7 +187,7 @@ class VehicleRunner:
         return self._seen_fault(now_s) or next(filter(None, words), "")
 
     def standing_fault(self, now_s: float) -> str:
-        """Return what enabling the vehicle now would not end, empty if nothing."""
+        """Return the fault that enabling the vehicle now would not end, empty if none."""
         heard = self._heard
         return self._seen_fault(now_s) or (heard.standing[0] if heard and heard.standing else "")
 
@@ -202,7 +202,7 @@ class VehicleRunner:
             raise UserError(f"vehicle {self.name} cannot be enabled: {words}")
 
     def enable(self) -> None:
-        """Enable the vehicle again, after a re-arm. A stop from before, on its way, is dropped."""
+        """Enable the vehicle again, after a re-arm; drop a stop that still waits."""
         with self._due:
             self._enable_due, self._next = True, None
             self._due.notify()
@@ -210,7 +210,7 @@ class VehicleRunner:
     def command(
         self, command: Command, scenario_speed_mps: Optional[float] = None, latch: bool = True
     ) -> None:
-        """Hand on a command in place of the last; not `latch`: a stop that needs no `enable`."""
+        """Pass on a command, in place of one that still waits. `latch`: as in `Vehicle.brake`."""
         with self._due:
             self._next = _Order(command, scenario_speed_mps, latch, time.monotonic())
             self._due.notify()
@@ -220,7 +220,7 @@ class VehicleRunner:
         with self._due:
             self._stopping = True
             self._due.notify()
-        if self._thread.ident is None:  # it was never started, and is closed all the same
+        if self._thread.ident is None:  # never started: started now, to close the driver
             self._thread.start()
         self._thread.join(_LEAVE_S)
         if hangs := self._thread.is_alive():
@@ -269,7 +269,7 @@ class VehicleRunner:
             self.on_fault()
 
     def _obey(self, order: _Order) -> None:
-        """Ask the driver. The mode alone makes a safe stop, whatever number is the policy's."""
+        """Command the driver. The mode alone makes a safe stop, whatever the action's numbers."""
         self._last = command = order.command
         now_s, vehicle = time.monotonic(), self._vehicle
         action = self._bounded(dict(zip(self._action_names, command.action)))
@@ -280,7 +280,7 @@ class VehicleRunner:
             elif len(command.action) != len(self._action_names):
                 raise ValueError(f"a command of {command.action} for {self._action_names}")
             elif self._not_enabled:
-                return  # that is the fault
+                return  # `fault` reports it
             elif now_s - order.given_s <= 2 * vehicle.control_period_s:  # old after a hang
                 vehicle.command(action, now_s, order.scenario_speed_mps)
         except BaseException as error:
@@ -332,11 +332,11 @@ class VehicleRunner:
         return fault.value if fault else ""
 
     def _ask(self) -> Optional[VehicleReport]:
-        """Return the vehicle's report; None where the driver fails: silence like any other."""
+        """Return the vehicle's report; None where the driver fails, which counts as silence."""
         try:
             report = _plain(self._vehicle.feedback(time.monotonic()), self._action_names)
             self._watch.report(report, time.monotonic())
-            # Odometry may say 0, or half: what is asked for is the second witness.
+            # Odometry may read too low: the commanded speed is a second source.
             most_mps = max(abs(report.speed_mps), abs(report.commanded_speed_mps or 0.0))
             self.leash.note(most_mps, time.monotonic())
         except BaseException as error:
@@ -349,12 +349,12 @@ class VehicleRunner:
 
 
 def _plain(report: VehicleReport, names: Sequence[str]) -> VehicleReport:
-    """Return the report in Python's own types; raises where it is none, or lacks one of `names`."""
+    """Convert a report to Python's own types; raise if it is none, or lacks one of `names`."""
     action = {name: float(value) for name, value in report.action.items()}
     if lacking := [name for name in names if name not in action]:
         raise ValueError(f"feedback without {', '.join(lacking)}")
-    said = (report.faults, report.standing)
-    faults, standing = ([printable(str(words)) for words in each] for each in said)
+    lists = (report.faults, report.standing)
+    faults, standing = ([printable(str(words)) for words in each] for each in lists)
     more = (None if value is None else float(value) for value in report[5:])
     speed_mps, braking = float(report.speed_mps), bool(report.self_braking)
     return VehicleReport(action, speed_mps, braking, faults, standing, *more)

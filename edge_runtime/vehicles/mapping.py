@@ -1,9 +1,9 @@
 """From a policy's actions to the units of a small robot, and back for its feedback. Pure.
 
-A robot that covers `scale` of the scenario car's way in the same time has `scale` of its speed and
-of its acceleration, and 1/`scale` of its path's curvature; so the policy's pictures stay true, and
-its control period too. Steering is converted by equal path, through each vehicle's own geometry.
-Angles are positive to the left.
+The robot drives the scenario car's path shrunk by `scale`, in the same time: speed and acceleration
+are times `scale`, curvature is divided by it, and the policy's pictures and control period stay
+valid. Steering is converted by equal path, through each vehicle's own geometry. Angles are positive
+to the left.
 
     pedal     -> acceleration of the scenario's car -> the robot's -> integrated: its speed
     steering  -> curvature of the car's path -> the robot's -> centre angle -> inner wheel
@@ -22,11 +22,11 @@ from edge_runtime.controller import ActionLimit
 from edge_runtime.manifest import Car, Manifest
 from edge_runtime.util import UserError
 
-# The set-point runs ahead of the speed by what full acceleration gives in this time, and no
-# further: a vehicle that was held up must not leap when it comes free (anti-windup).
+# The set-point leads the measured speed by at most full acceleration for this time: a vehicle that
+# was held up must not leap when it comes free (anti-windup).
 LEAD_S = 0.5
-RUNAWAY = 0.2  # of top speed, twice plausibility.DEVIATION: it follows a runaway no closer
-_LONGEST_STEP_S = 0.1  # after a pause of the process the pedal was not held for it
+RUNAWAY = 0.2  # of top speed, twice plausibility.DEVIATION: the set-point stays this far below
+_LONGEST_STEP_S = 0.1  # the pedal was not held throughout a pause of the process
 
 
 def clamp(value: float, most: float) -> float:
@@ -34,7 +34,7 @@ def clamp(value: float, most: float) -> float:
 
 
 class HunterSpec(NamedTuple):
-    """A model's limits and geometry. Angles are those of the inner front wheel, as it is told.
+    """A model's limits and geometry. Angles are those of the inner front wheel, as commanded.
 
     Speed, angle, wheelbase and track: the maker's data sheets. The steering rate is in none of
     them: it is how fast this runtime lets the request change, and the chassis may be slower.
@@ -56,7 +56,7 @@ class HunterSpec(NamedTuple):
         return self._turned(abs(inner_rad), inner_rad, 0.5 * self.track_m)
 
     def _turned(self, angle_rad: float, sign: float, wider_m: float) -> float:
-        """Return the angle of a wheel whose circle is so much wider."""
+        """Return the angle of a wheel whose turning circle's radius is `wider_m` larger."""
         slope = math.tan(angle_rad)
         turned_rad = math.atan2(self.wheelbase_m * slope, self.wheelbase_m + wider_m * slope)
         return math.copysign(turned_rad, sign)
@@ -71,7 +71,7 @@ SPECS: Dict[str, HunterSpec] = {
 
 
 class Similarity(NamedTuple):
-    """A robot in the place of a scenario's car. `scale`: its metres for one of the scenario."""
+    """A robot in place of the scenario's car. `scale`: its metres for a metre of the scenario."""
 
     car: Car
     spec: HunterSpec
@@ -120,14 +120,14 @@ class Similarity(NamedTuple):
 
 
 def similarity_to(car: Car, spec: HunterSpec, scale: Optional[float] = None) -> Similarity:
-    """Return the similarity of a robot; by default its top speed is the car's top speed."""
+    """Return the similarity of a robot; by default the two top speeds correspond."""
     return Similarity(car, spec, spec.max_speed_mps / car.max_speed_mps if scale is None else scale)
 
 
 class RobotSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of every vehicle that takes a speed and an angle; `car`: in the manifest's place.
+    """Settings of every vehicle that takes a speed and an angle; `car` overrides the manifest's.
 
-    `scale`: metres of the vehicle for one of the scenario; None: top speed is top speed.
+    `scale`: metres of the vehicle for a metre of the scenario; None: the top speeds correspond.
     """
 
     model: str = "2.0"
@@ -144,15 +144,15 @@ class RobotSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
                 f"the manifest of {manifest.task!r} does not say which car it was trained on: set"
                 f" car in {table} of --config"
             )
-        found = similarity_to(car, SPECS[self.model], self.scale)
-        numbers = {**msgspec.structs.asdict(car), "scale": found.scale}
+        similarity = similarity_to(car, SPECS[self.model], self.scale)
+        numbers = {**msgspec.structs.asdict(car), "scale": similarity.scale}
         full_rad = numbers.pop("full_steering_rad")  # below 0 where it turns to the right
         if not (0.0 < abs(full_rad) < 1.5 and all(0.0 < n < math.inf for n in numbers.values())):
             raise UserError(
                 f"{table}: scale or car is not valid: numbers above 0, and full_steering_rad below"
                 f" 1.5 to either side, not {numbers} and {full_rad}"
             )
-        return found
+        return similarity
 
 
 class Wish(NamedTuple):
@@ -164,7 +164,7 @@ class Wish(NamedTuple):
 
 
 def wish_of(action: Dict[str, float], scenario_speed_mps: Optional[float]) -> Wish:
-    """Return an action's command, within -1 to 1; ValueError: not finite, or no speed in it."""
+    """Read an action, clamped to -1 to 1; ValueError if not finite, or without pedal and speed."""
     if not all(map(math.isfinite, [*action.values(), scenario_speed_mps or 0.0])):
         raise ValueError(f"a command that is not finite: {action}, {scenario_speed_mps} m/s")
     if not action or ("pedal" not in action and scenario_speed_mps is None):
@@ -198,7 +198,7 @@ class SetPoint:
             lead_mps = similarity.acceleration_mps2(1.0) * LEAD_S
             speed_mps = self.speed_mps + similarity.acceleration_mps2(wish.pedal) * step_s
             speed_mps = min(speed_mps, measured_mps + lead_mps)
-            if wish.pedal > 0:  # a brake that does not bite is asked for all the more
+            if wish.pedal > 0:  # no floor while braking: a weak brake is asked for more
                 behind_mps = max(lead_mps, RUNAWAY * spec.max_speed_mps)
                 speed_mps = max(speed_mps, measured_mps - behind_mps)
         else:  # the scenario has the pedals

@@ -38,8 +38,8 @@ class MockVehicle(Vehicle):
     """Obeys pedal and steering; brakes by itself when no command came for 2 T."""
 
     name: ClassVar[str] = "mock"
-    # Every action of a policy goes through unchanged, in lock-step, too, where states follow one
-    # another faster than its time. What the body does with it is the lag's business.
+    # No slew limit: in lock-step, states follow one another faster than the mock's time, and every
+    # action must pass unchanged. The actuators' rate and lag act on it later.
     limits: Dict[str, ActionLimit] = dict.fromkeys(("pedal", "steering"), ActionLimit(-1.0, 1.0))
 
     def __init__(
@@ -56,7 +56,7 @@ class MockVehicle(Vehicle):
 
     @classmethod
     def open(cls, settings: Mapping[str, Any], manifest: Manifest) -> Vehicle:
-        """Be as quick as the policy's car, where that is known and the settings do not say."""
+        """Make a mock with the body of the policy's car, unless the settings say otherwise."""
         car = msgspec.structs.asdict(manifest.car) if manifest.car else {}
         known = {name: car[name] for name in MockParameters.__struct_fields__ if name in car}
         parameters = convert({**known, **settings}, MockParameters, "vehicle.mock")
@@ -71,14 +71,14 @@ class MockVehicle(Vehicle):
         return made.limits, made.model_limits
 
     def enable(self, now_s: float) -> None:
-        """Take a stop back; the brake is on until the first command."""
+        """Release the latch; the brake is on until the first command."""
         self._integrate(now_s)
         self._latched = False
 
     def command(
         self, action: Dict[str, float], now_s: float, scenario_speed_mps: Optional[float] = None
     ) -> None:
-        """Take an action; one that a policy does not have is zero: no pedal, wheels straight."""
+        """Take an action; a missing one is zero: no pedal, wheels straight."""
         if not action.keys() & self.limits.keys():
             raise ValueError(f"a command that lacks an action: {action}")
         if not all(map(math.isfinite, action.values())):
@@ -90,7 +90,7 @@ class MockVehicle(Vehicle):
             self._on_the_way.append((now_s + self._parameters.dead_time_s, target))
 
     def brake(self, now_s: float, latch: bool = True) -> None:
-        """Brake without the dead time of a command's way."""
+        """Brake at once, without the dead time of a command."""
         self._integrate(now_s)
         self._latched = self._latched or latch
         self._on_the_way.clear()

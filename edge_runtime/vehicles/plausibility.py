@@ -1,4 +1,4 @@
-"""Whether a vehicle can be believed. Pure: every call is passed the time, in monotonic seconds.
+"""Check a vehicle's reports for silence, lies and stuck actuators. Pure: time is passed in.
 
 `VehicleWatch` sees the commands and reports of any driver. `DriveWatch` sees set-point and feedback
 of a streamed vehicle, in m/s and rad; so it finds a steering that does not follow.
@@ -17,18 +17,18 @@ from edge_runtime.vehicles.mapping import HunterSpec
 
 PEDAL = "pedal"
 ENABLE_TIMEOUT_S = 1.0  # a vehicle may take so long to confirm that it is enabled
-DEVIATES_S = 0.1  # an actuator is stuck that deviates for so long without a break
+DEVIATES_S = 0.1  # an actuator that deviates for this long without a break is stuck
 
 # Any driver: an actuator may be at what was asked within LAG_S, give or take a share of its range.
 LAG_S = 0.3
 LAG_DEVIATION = 0.125
 MAX_ACCELERATION_MPS2 = 15.0  # no tyre gives more, on dry asphalt and without wings
 SPEED_NOISE_MPS = 0.5
-OVER_CAP, OVER_CAP_MPS = 1.1, 0.02  # by so much, a driver does not hold the operator's speed cap
+OVER_CAP, OVER_CAP_MPS = 1.1, 0.02  # a speed over cap * OVER_CAP + OVER_CAP_MPS breaks the cap
 _ROUNDING = 5e-4  # of an action's range
 
-# A streamed vehicle: the age of a set-point that a drive may still follow; that of a wheel, by its
-# dead time and lag (what is heard of it is older still); and a share of top speed or of full lock.
+# A streamed vehicle: how long its speed may trail a set-point, and its wheels, by their dead time
+# and lag (feedback is older still); tolerance as a share of top speed or of full lock.
 FOLLOWS_S = 1.0
 STEERS_S = 0.2
 DEVIATION = 0.1
@@ -40,7 +40,7 @@ class VehicleReport(NamedTuple):
 
     `faults` say in words why it does not drive, until it is enabled again; `standing` are those
     whose cause is there now. A vehicle that takes a speed instead of a pedal reports two speeds
-    more: its own in the scenario, and the one that it is asked for (m/s of its own).
+    more: its speed at the scenario's scale, and the one that it is asked for (its own m/s).
     """
 
     action: Dict[str, float]
@@ -65,7 +65,7 @@ class Fault(str, Enum):
 
 
 class Finding(NamedTuple):
-    """A fault, or another event of a streamed vehicle; `words` are empty for what we asked for."""
+    """A fault, or another event of a streamed vehicle; `words` are empty for a requested event."""
 
     event: Enum
     words: str = ""
@@ -127,7 +127,7 @@ class VehicleWatch:
     def command(self, action: Dict[str, float], now_s: float, drives: bool = True) -> None:
         """Note what was asked; `drives` is False for a safe stop, which brakes whatever is asked.
 
-        A pedal may then be at what the policy asks for, too; one that it does not have may not.
+        The pedal may then also be where the action puts it, if the action has a pedal.
         """
         self._drives = drives
         if not drives:
@@ -167,20 +167,20 @@ class VehicleWatch:
             slack = _ROUNDING * (high - low)
             if not low - slack <= value <= high + slack:  # NaN is in no range
                 return True
-        # From the last possible report on: a leap is a lie until that speed could be real.
+        # Since the last possible report: a leap is a lie until the speed can have been reached.
         since_s, speed_mps = self._believed or (now_s, report.speed_mps)
         most_mps = SPEED_NOISE_MPS + MAX_ACCELERATION_MPS2 * (now_s - since_s)
-        return not abs(report.speed_mps - speed_mps) <= most_mps  # nor is NaN, or inf - inf
+        return not abs(report.speed_mps - speed_mps) <= most_mps  # also for NaN, and inf - inf
 
     def _is_astray(self, report: VehicleReport, now_s: float) -> bool:
         if report.self_braking or not self._asked.is_full(now_s):
             return False  # it obeys no command yet, or has had no time to
         for name, value in report.action.items():
             if name == PEDAL and report.commanded_speed_mps is not None:
-                continue  # worked out from a speed, whose limits are the driver's to judge
+                continue  # derived from a speed, which the driver itself judges
             asked = [action.get(name) for action in self._asked.values]
             if None in asked:
-                continue  # in a drive, nobody asks for what the policy does not have
+                continue  # in a drive, the policy does not command this action
             low, high = self._range(name)
             most = LAG_DEVIATION * (high - low)
             if not min(asked) - most <= value <= max(asked) + most:
@@ -194,10 +194,10 @@ class VehicleWatch:
 
 
 class FollowWatch:
-    """Watch whether a measured value stays outside of all that a healthy actuator can do.
+    """Watch whether a measured value stays outside of a healthy actuator's band.
 
-    It is, give or take `tolerance`, where it was asked to be within `follows_s`. At first, or where
-    it was not judged for a time, it comes from elsewhere: by `rate` a second.
+    The band spans all that was asked within `follows_s`, widened by `tolerance`. At first, or after
+    a time without judgement, it begins at the measured value and moves by `rate` a second.
     """
 
     def __init__(self, tolerance: float, follows_s: float, rate: float = 1e9) -> None:
@@ -248,7 +248,7 @@ class DriveWatch:
 
 
 def impossible(speed_mps: float, inner_rad: float, spec: HunterSpec) -> str:
-    """Say what no vehicle of the model can do; empty where it can."""
+    """Return the value that no vehicle of the model can reach, in words; empty if none."""
     if abs(speed_mps) > IMPOSSIBLE * spec.max_speed_mps:
         return f"{speed_mps:.1f} m/s"
     if abs(inner_rad) > IMPOSSIBLE * spec.max_inner_steering_rad:

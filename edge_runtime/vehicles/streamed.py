@@ -1,7 +1,7 @@
-"""The driver of a vehicle that must hear from it 50 times a second: what decides, and what sends.
+"""The driver of a vehicle that needs a command 50 times a second: a pure core and its shell.
 
-`StreamedCore` decides, by a state machine (LEADS_TO). It is pure: its holder serialises the calls,
-passes monotonic seconds, and sends what `tick` returns. `StreamedVehicle` is the shell.
+`StreamedCore` decides, by a state machine (LEADS_TO). It is pure: `StreamedVehicle` serialises the
+calls, passes monotonic seconds, and sends what `tick` returns.
 
 STOPPED is a latch of our own, and only ENABLE leads out: a chassis takes commands again by itself,
 when they resume, when the remote control lets go, or when an error passes.
@@ -28,11 +28,11 @@ from edge_runtime.vehicles.mapping import RobotSettings, SetPoint, Similarity, W
 from edge_runtime.vehicles.plausibility import ENABLE_TIMEOUT_S, DriveWatch, Fault, Finding
 
 PERIOD_S = 0.02
-# A beat later than the runtime's own silence rule, which then tells the reason.
+# One period later than the runtime's own silence rule, so that the runtime names the reason.
 BEAT_S = 0.02
 LEAST_SILENCE_S = 0.06  # three reports of a vehicle that sends fifty a second
-# At the end zeros go out for so long, unless it is known to stand before; and what is then not
-# known to stand gets the parking brake, where there is one.
+# At the end zeros are sent for this long, or until the vehicle is known to stand. If it is not
+# known to stand by then, the parking brake is locked, where there is one.
 STOP_TAKES_S = 1.0
 STANDS_MPS = 0.02
 _WINDOW_S = 0.11
@@ -78,11 +78,11 @@ LEADS_TO: Dict[Enum, Dict[VehicleState, VehicleState]] = {
     VehicleEvent.COMMAND_LATE: {_E: _X},  # while ENABLING nothing moves yet
     VehicleEvent.REMOTE: {_G: _X, _E: _X},
     VehicleEvent.ESTOP: {_G: _X, _E: _X},
-    VehicleEvent.STANDBY: {_E: _X},  # what ENABLING is to end; so are the next three
+    VehicleEvent.STANDBY: {_E: _X},  # ENABLING is there to end this, and the next three
     VehicleEvent.LOCKED: {_E: _X},
     VehicleEvent.FAULT: {_E: _X},
     Fault.SILENT: {_E: _X},
-    Fault.LYING: {_G: _X, _E: _X},  # it confirms nothing, and need not be waited for
+    Fault.LYING: {_G: _X, _E: _X},  # no confirmation can follow
     Fault.STUCK: {_E: _X},
     Fault.STEERING_STUCK: {_E: _X},
     VehicleEvent.BUS: {_G: _X, _E: _X},
@@ -118,7 +118,7 @@ class Speeds:
 
 
 class StreamedCore(abc.ABC):
-    """The state machine, and what is asked for. `heard` is what the vehicle said of itself."""
+    """The state machine and its set-point. `heard` holds the speeds that the vehicle reported."""
 
     def __init__(self, similarity: Similarity, heard: Speeds) -> None:
         self.state = VehicleState.DISABLED
@@ -133,7 +133,7 @@ class StreamedCore(abc.ABC):
         self._since_s = -math.inf  # when this state began
 
     def follow_period(self, control_period_s: float) -> None:
-        """Take the policy's control period T: how long a command holds, and feedback may miss."""
+        """Set how long a command holds and feedback may be missing, from the policy's period T."""
         self.command_timeout_s = SILENCE_PERIODS * control_period_s + BEAT_S
         self._heard.silence_s = max(2 * control_period_s, LEAST_SILENCE_S)
 
@@ -145,7 +145,7 @@ class StreamedCore(abc.ABC):
     def command(
         self, action: Dict[str, float], now_s: float, scenario_speed_mps: Optional[float] = None
     ) -> None:
-        """Take the newest command; forget it where it may not drive. ValueError: see `wish_of`."""
+        """Take the newest command; ignore it unless ENABLED. Raises ValueError as `wish_of`."""
         wish = wish_of(action, scenario_speed_mps)
         if self.state is VehicleState.ENABLED:
             self._wish, self._wished_s = wish, now_s
@@ -171,7 +171,7 @@ class StreamedCore(abc.ABC):
         words = [self.words] if self.words else []
         faults = words + [more for more in standing if more not in words]
         return VehicleReport(
-            # A milliradian beyond its reach would count as a lie.
+            # Unclamped, a milliradian beyond the reach would count as a lie.
             action={"pedal": pedal, "steering": clamp(steering, self.similarity.reach)},
             speed_mps=heard.speed_mps,
             self_braking=self.state is not VehicleState.ENABLED,
@@ -182,7 +182,7 @@ class StreamedCore(abc.ABC):
         )
 
     def standing(self, now_s: float) -> List[str]:
-        """Return in words what would make an `enable` now be in vain."""
+        """Return in words why an `enable` now would fail."""
         silence = None if self._has_asked else self._silence(-math.inf, now_s)
         return [silence.words] if silence else []
 
@@ -234,8 +234,8 @@ class StreamedCore(abc.ABC):
         )
         words = f"no command for {self.command_timeout_s:.2f} s"
         late = Finding(VehicleEvent.COMMAND_LATE, words) if now_s > self.late_at_s else None
-        if found := self._silence(self._since_s, now_s) or late or stuck:
-            self._apply(found, now_s)
+        if finding := self._silence(self._since_s, now_s) or late or stuck:
+            self._apply(finding, now_s)
 
     def _step(self, now_s: float) -> None:
         """Move the set-point by the time since the last tick."""
@@ -247,7 +247,7 @@ class StreamedCore(abc.ABC):
 
 
 class StreamedVehicle(Vehicle):
-    """A lock around every call of a core, and a thread that sends what the core asks for.
+    """Locks every call of a core, and sends in a thread what the core's `tick` returns.
 
     A driver starts `_stream` at the end of `__init__`. Bus and network are called outside of the
     lock, so that no caller waits for them.
@@ -266,10 +266,10 @@ class StreamedVehicle(Vehicle):
 
     @classmethod
     def open(cls, settings: Mapping[str, Any], manifest: Manifest) -> Vehicle:
-        given, similarity = cls._read(settings, manifest)
-        make: Any = cls  # of each driver's own settings
-        made: Vehicle = make(given, similarity)
-        return made
+        parsed, similarity = cls._read(settings, manifest)
+        make: Any = cls  # takes the driver's own settings
+        vehicle: Vehicle = make(parsed, similarity)
+        return vehicle
 
     @classmethod
     def limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Tuple[Limits, Model]:
@@ -278,8 +278,8 @@ class StreamedVehicle(Vehicle):
 
     @classmethod
     def _read(cls, settings: Mapping[str, Any], manifest: Manifest) -> Tuple[Any, Similarity]:
-        given = convert(settings, cls.settings_type, f"vehicle.{cls.name}")
-        return given, given.similarity(cls.name, manifest)
+        parsed = convert(settings, cls.settings_type, f"vehicle.{cls.name}")
+        return parsed, parsed.similarity(cls.name, manifest)
 
     def take_bounds(self, bounds: Bounds) -> None:
         super().take_bounds(bounds)
@@ -357,8 +357,8 @@ class StreamedVehicle(Vehicle):
             sent = not self._is_mute and self._send_due()
             now_s = time.monotonic()
             if sent and now_s - began_s > PERIOD_S:
-                # A process that was stopped in between has sent what was asked for before.
-                # The vehicle cannot tell, and may have control again: the next does not wait.
+                # A process that was suspended in between has just sent an old command, which the
+                # vehicle may obey: the next one does not wait.
                 self._wake.set()
             if now_s >= next_s:
                 # After a pause one sending, not one for each missed period.

@@ -1,8 +1,8 @@
-"""AgileX Hunter 2.0 and SE: what decides, the CAN bus, and the driver between them.
+"""AgileX Hunter 2.0 and SE: the pure core, the CAN bus, and the driver that joins them.
 
-`HunterCore` is pure: it hears every frame of the bus, and its `tick` gives the frames to send.
-`HunterVehicle` puts two threads around it: the stream's is the only one that sends until `close`
-has joined it; the listener's hands every frame to `hear`.
+`HunterCore` is pure: it hears every frame of the bus, and its `tick` returns the frames to send.
+`HunterVehicle` puts two threads around it: the stream thread alone sends, until `close` has joined
+it; the listener thread passes every frame to `hear`.
 
 Nothing else in the runtime imports python-can, which a board without a CAN vehicle need not have.
 """
@@ -27,7 +27,7 @@ from edge_runtime.vehicles.plausibility import Fault, Finding
 from edge_runtime.vehicles.streamed import STOP_TAKES_S, VehicleEvent, VehicleState
 
 STATUS_SILENCE_S = 0.3  # three frames of 0x211; 0x221 comes five times as often
-COUNTERS = 256  # byte 7 of 0x211 runs over
+COUNTERS = 256  # byte 7 of 0x211 wraps around
 ASK_AGAIN_S = 0.1  # a frame may be lost, and the chassis answers every 100 ms
 BUS_PATIENCE_S = 0.1  # five frames of the stream
 REMOTE_DRIVES, ESTOP_PRESSED = "the remote control drives", "the emergency stop is pressed"
@@ -52,12 +52,12 @@ class Reports(streamed.Speeds):
         self._motor_faults: Dict[int, List[str]] = {}
 
     def hear(self, can_id: int, data: bytes, now_s: float) -> None:
-        """Note a frame, unless it is not in the table or of a wrong length."""
+        """Note a frame; ignore an unknown identifier or a wrong length."""
         message = protocol.decode(can_id, data)
         if isinstance(message, SystemStatus):
             was_silent = now_s - self._last_status_s > STATUS_SILENCE_S
             self.status, self._last_status_s = message, now_s
-            # Up to 127 ahead is newer: frames that are replayed lie behind, and show nobody alive.
+            # Up to 127 ahead is newer; replayed frames lie behind, and do not show a live chassis.
             ahead = (message.counter - self._counter) % COUNTERS
             if was_silent or 0 < ahead < COUNTERS // 2:
                 self._counter, self.status_s = message.counter, now_s
@@ -72,13 +72,13 @@ class Reports(streamed.Speeds):
 
     @property
     def needs_clearing(self) -> bool:
-        """Whether it shows an error; a lost link goes by itself, with the stream's first frame."""
+        """Whether it shows an error to clear; a lost link ends with the stream's first frame."""
         is_exception = self.status is not None and self.status.state == protocol.STATE_EXCEPTION
         return is_exception or bool({*self._errors()} - {protocol.LINK_LOST})
 
     @property
     def remote_drives(self) -> bool:
-        """Whether the remote control had the vehicle when it was last heard."""
+        """Whether the newest status shows remote control."""
         return self.status is not None and self.status.mode == protocol.REMOTE_CONTROL
 
     def _errors(self) -> List[str]:
@@ -96,7 +96,7 @@ class Reports(streamed.Speeds):
         return None
 
     def finding(self) -> Optional[Finding]:
-        """Return the gravest that stands between the chassis and our commands now."""
+        """Return the gravest reason why the chassis does not follow commands now; None if none."""
         status = self.status
         if status is None:
             return Finding(Fault.SILENT, "the chassis sends no 0x211")
@@ -144,31 +144,31 @@ class HunterCore(streamed.StreamedCore):
     def hear(self, can_id: int, data: bytes, now_s: float) -> None:
         """Take a frame of the bus, from any sender; never raises."""
         if self.state is VehicleState.DISABLED:
-            self.bus_works()  # nothing is sent then that it could take
+            self.bus_works()  # nothing is sent that could show it
         if can_id in protocol.COMMAND_IDS:
             words = f"somebody else sends 0x{can_id:x}"
             self._apply(Finding(VehicleEvent.FOREIGN, words), now_s)
             return
         self.reports.hear(can_id, data, now_s)
         if can_id == protocol.SYSTEM_STATUS.can_id or can_id in protocol.MOTOR_OF_SLOW:
-            is_older = self.reports.status_s <= self._since_s  # from before it was asked
+            is_older = self.reports.status_s <= self._since_s  # from before `enable`
             if self.state is not VehicleState.ENABLING or not is_older:
-                found = self.reports.finding()
-                self._apply(found or Finding(VehicleEvent.CONFIRMED), now_s)
+                finding = self.reports.finding()
+                self._apply(finding or Finding(VehicleEvent.CONFIRMED), now_s)
         elif can_id == protocol.MOTION_STATUS.can_id and (lie := self.reports.lie()):
-            # At once, not with the next tick: else the runtime's own watch would stop it first,
-            # and what it then says is over with the lie.
+            # At once, not with the next tick: otherwise the runtime's own watch stops the vehicle
+            # first, and its reason ends with the lie.
             self._apply(lie, now_s)
 
     def bus_failed(self, words: str, now_s: float, fatal: bool = False) -> None:
-        """Note that the bus did not take a frame, or gave none; `fatal`: it says that it is off."""
+        """Note that the bus failed to send or to receive; `fatal`: it reports bus-off."""
         self._bus_fails_since_s = min(self._bus_fails_since_s, now_s)
         if fatal or now_s - self._bus_fails_since_s > BUS_PATIENCE_S:
             self._bus_words = f"the CAN bus fails: {words}"
             self._apply(Finding(VehicleEvent.BUS, self._bus_words), now_s)
 
     def bus_works(self) -> None:
-        """Note that the bus took a frame, or (while none is sent) gave one."""
+        """Note that the bus sent a frame, or (while none is sent) received one."""
         self._bus_fails_since_s, self._bus_words = math.inf, ""
 
     def tick(self, now_s: float) -> List[Sent]:
@@ -185,7 +185,7 @@ class HunterCore(streamed.StreamedCore):
         return super().report(now_s)._replace(battery_v=status.battery_v if status else None)
 
     def is_at_rest(self, now_s: float) -> bool:
-        """Return whether it is known to stand, or the bus is dead or the remote control drives."""
+        """Return whether it is known to stand, or is out of reach (dead bus, remote control)."""
         is_out = self.state is VehicleState.DISABLED or bool(self._bus_words)
         return is_out or self.reports.remote_drives or self.reports.is_known_to_stand(now_s)
 
@@ -193,7 +193,7 @@ class HunterCore(streamed.StreamedCore):
         before = self.state
         super()._apply(finding, now_s)
         if self.state is not before and self.state is VehicleState.STOPPED:
-            at_once = finding.event is Fault.STUCK  # no set-point will stop it: the brake must
+            at_once = finding.event is Fault.STUCK  # set-points do not stop it: the brake must
             self._ask_s = now_s + (0.0 if at_once else STOP_TAKES_S)
         elif self.state is VehicleState.ENABLED:
             self._ask_s = math.inf
@@ -201,9 +201,9 @@ class HunterCore(streamed.StreamedCore):
     def standing(self, now_s: float) -> List[str]:
         if self._has_asked:
             return []
-        found = self.reports.finding()
-        outranks = found is not None and found.event in (VehicleEvent.REMOTE, VehicleEvent.ESTOP)
-        words = [found.words] if found and outranks else []
+        finding = self.reports.finding()
+        outranks = finding and finding.event in (VehicleEvent.REMOTE, VehicleEvent.ESTOP)
+        words = [finding.words] if finding and outranks else []
         return words + super().standing(now_s) + ([self._bus_words] if self._bus_words else [])
 
     def _hindrance(self, now_s: float) -> Optional[Finding]:
@@ -213,7 +213,7 @@ class HunterCore(streamed.StreamedCore):
         return self.reports.silence(since_s, now_s)
 
     def _requests(self, now_s: float) -> List[Sent]:
-        """Return what goes beside the stream: for control if ENABLING, for the brake if STOPPED."""
+        """Return the frames beside the stream: take control if ENABLING, lock if STOPPED."""
         self._ask_s = now_s + ASK_AGAIN_S
         if self.state is VehicleState.STOPPED:
             # A person with the remote control knows better than we do.
@@ -233,7 +233,7 @@ class HunterCore(streamed.StreamedCore):
 DEFAULT_BUS = "socketcan:can0"
 UDP = "udp_multicast"
 MULTICAST_GROUP = "239.74.163.2"  # python-can's own
-# Two buses need two ports: Linux hands what comes for any group to every socket of its port.
+# Two buses need two ports: Linux delivers the packets of any group to every socket of the port.
 MULTICAST_BUS = f"{UDP}:{MULTICAST_GROUP}:43113"
 _LISTEN_S, _JOIN_S = 0.1, 0.5
 _ERROR_BUS_OFF = 0x40  # of SocketCAN's error frames (linux/can/error.h)
@@ -255,7 +255,7 @@ def parse_bus(text: str) -> Dict[str, Any]:
 
 def open_bus(bus: Dict[str, Any]) -> Any:
     """Open a python-can bus; send nothing. Raises UserError."""
-    # Its backends say on stderr what they miss; our error says it in its one line.
+    # Its backends complain on stderr; our one-line error covers that.
     logging.getLogger("can").setLevel(logging.CRITICAL)
     try:
         import can
@@ -292,7 +292,7 @@ class HunterVehicle(streamed.StreamedVehicle):
     def __init__(self, settings: HunterSettings, similarity: Similarity) -> None:
         bus = parse_bus(settings.bus)
         self._bus: Any = open_bus(bus)
-        # Our own frames come back there: a command need not be somebody else's.
+        # UDP multicast returns our own frames: a command there need not be somebody else's.
         self._ignores_commands = bus["interface"] == UDP
         self._core: HunterCore
         super().__init__(HunterCore(similarity, settings.profile))

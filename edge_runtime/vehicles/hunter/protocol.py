@@ -3,8 +3,8 @@
 CAN 2.0B with 11-bit identifiers, 500 kbit/s, big-endian, no checksum, by the maker's manual. All
 frames go both ways here: the mock of the chassis speaks the other side.
 
-Firmwares place the bits of 0x211 elsewhere, so that the profile is a setting. A bit that it does
-not know is a fault as well.
+Firmwares differ in the fault bits of 0x211, so the profile is a setting. A bit that the profile
+does not know is a fault, too.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ STATE_OK, STATE_ESTOP, STATE_EXCEPTION = 0, 1, 2
 
 
 class WheelMotion(NamedTuple):
-    """0x111: what is asked, every 20 ms; the chassis waits 500 ms for the next. 0x221: what is."""
+    """0x111: the request, every 20 ms; the chassis times out after 500 ms. 0x221: the motion."""
 
     speed_mps: float
     inner_steering_rad: float
@@ -69,8 +69,8 @@ class MotorSlow(NamedTuple):
 class Frame(NamedTuple):
     """A row of the table.
 
-    `layout` is as struct has it: a letter, without a count, for each field of the message, and x
-    for bytes that are 0. `worth` says of each field what one count is; an integer counts by 1.
+    `layout` is a format of struct: a letter, without a count, for each field of the message, and x
+    for bytes that are 0. `worth` is the value of one count of each field, 1 for an integer.
     """
 
     can_id: int
@@ -119,7 +119,7 @@ MOTOR_OF_SLOW = {frame.can_id: motor for frame, motor in zip(MOTORS_SLOW, _MOTOR
 def encode(frame: Frame, message: Any) -> bytes:
     """Return a message's data, clamped to what each field can hold; ValueError if not finite."""
     counts = []
-    numbers = filter("bBhHi".__contains__, frame.layout)  # The others are space between them.
+    numbers = filter("bBhHi".__contains__, frame.layout)  # The other letters are padding.
     for code, worth, value in zip(numbers, frame.worth, message):
         if not math.isfinite(value):
             raise ValueError(f"{value} is no number for the bus")
@@ -145,7 +145,7 @@ def decode(can_id: int, data: bytes) -> Any:
     return frame.message(*(count * worth for count, worth in zip(counts, frame.worth)))
 
 
-# While nobody streams, the chassis misses its upper computer: only a fault once we stream.
+# The chassis reports this while nobody streams: it is a fault only once we stream.
 LINK_LOST = "link to the upper computer lost"
 UNDERVOLTAGE = "battery undervoltage"
 REMOTE_LOST = "remote control lost"

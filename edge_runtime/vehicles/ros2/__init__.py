@@ -1,8 +1,8 @@
 """A vehicle behind its own ROS 2 driver: standard messages on Zenoh. See README.md.
 
-First the messages without ROS 2; then what decides, pure; then the session and two threads. The
-stream's publishes what `tick` gives, for the ROS driver has no stream of its own. Zenoh's hands
-every odometry to `hear`.
+First the messages, without ROS 2; then the pure core; then the session and two threads. The stream
+thread publishes what `tick` returns, because the ROS driver has no stream of its own; Zenoh's
+thread passes every odometry to `hear`.
 
 A message is little-endian CDR (XCDR version 1) behind a header of four bytes, `00 01 00 00`. Each
 field is aligned to its size, counted from behind the header. Types and order of fields are those of
@@ -29,7 +29,7 @@ from edge_runtime.vehicles.mapping import RobotSettings, Similarity
 from edge_runtime.vehicles.plausibility import Fault, Finding, impossible
 from edge_runtime.vehicles.streamed import VehicleEvent, VehicleState
 
-# Beside our own 7447, where a bridge listens by default, too; and of this machine only.
+# Not 7447, where our own link and, by default, a bridge listen; and of this machine only.
 DEFAULT_ROS2_ENDPOINT = "tcp/127.0.0.1:7448"
 YAW_RATE, STEERING = "yaw_rate", "steering"
 _WORD = "[A-Za-z_][A-Za-z0-9_]*"
@@ -66,14 +66,14 @@ TYPES: Dict[str, str] = {
 
 MAX_PAYLOAD_BYTES = 1024 * 1024
 _LITTLE_ENDIAN = b"\0\1\0\0"
-_ALIGNMENT = 4  # DDS fills a message up to this.
+_ALIGNMENT = 4  # DDS pads a message to this.
 # Of an odometry: a position, a quaternion, their covariance; two vectors of speed, theirs.
 _DOUBLES = 3 + 4 + 36 + 6 + 36
 _LINEAR_X, _ANGULAR_Z = 43, 48
 
 
 class Odometry(NamedTuple):
-    """What is read of a nav_msgs/Odometry: its stamp (0: none), and its twist (m/s, rad/s)."""
+    """The fields read of a nav_msgs/Odometry: its stamp (0: none), and its twist (m/s, rad/s)."""
 
     stamp_ns: int
     linear_x: float
@@ -92,7 +92,7 @@ def read_odometry(payload: bytes) -> Optional[Odometry]:
         numbers = struct.unpack_from(f"<{_DOUBLES}d", payload, begin)
     except struct.error:
         return None
-    # The type is not in the payload: what is left over is the mark of another one.
+    # The payload does not name its type: left-over bytes mean another type.
     is_longer = len(payload) - begin - 8 * _DOUBLES >= _ALIGNMENT
     if is_longer or not all(map(math.isfinite, numbers)):
         return None
@@ -106,7 +106,7 @@ def _aligned(place: int, size: int) -> int:
 def twist_of(motion: Motion, angular: str, wheelbase_m: float) -> bytes:
     """Return a Twist: `linear.x` in m/s, `angular.z` as yaw rate (rad/s) or steering angle (rad).
 
-    A yaw rate of 0 says nothing of the wheels of a vehicle that stands: they go straight.
+    At a stand the yaw rate is 0, whatever the steering: the wheels then go straight.
     """
     z = motion.centre_rad
     if angular != STEERING:
@@ -118,9 +118,9 @@ def topic_token(member: str, role: str, key: str, kind: str) -> str:
     """Return the token of a member's PUBLISHER or SUBSCRIBER, as zenoh-bridge-ros2dds has it.
 
     It makes every bridge (1.1 or later) create the reader or writer on its DDS side. Its last part
-    is `<keyed>:<reliable>:<transient local>:<history>,<depth>:<user data>` in DDS's numbers. A
-    reader of either kind hears a reliable writer; a reliable reader hears no best-effort one, as
-    sensors are.
+    is `<keyed>:<reliable>:<transient local>:<history>,<depth>:<user data>` in DDS's numbers. Our
+    writer is reliable, for readers of either kind; our reader is best-effort, as a reliable one
+    would not hear the best-effort writers that sensors are.
     """
     names = (name.replace("/", _SLASH) for name in (key, kind))
     qos = f":{int(role == PUBLISHER)}:0:0,10:typehash=RIHS01_{TYPES[kind]};"
@@ -172,8 +172,8 @@ class Ros2Core(streamed.StreamedCore):
         self._apply(Finding(VehicleEvent.CLOSE), now_s)
 
     def hear(self, stamp_ns: int, speed_mps: float, angular: float, now_s: float) -> None:
-        """Take finite odometry; one counts that is newer by its own stamp, or has none (0)."""
-        # While nothing is driven, a clock set back is believed; a repetition is not.
+        """Take finite odometry; ignore it if its stamp is not newer (0: it has no stamp)."""
+        # While nothing is driven, an older stamp is accepted (a clock set back), an equal one not.
         is_older = stamp_ns < self._stamp_ns and self._has_asked
         if stamp_ns > 0 and (is_older or stamp_ns == self._stamp_ns):
             return
@@ -201,7 +201,7 @@ class Ros2Core(streamed.StreamedCore):
         return Finding(Fault.SILENT, f"no fresh odometry on {self._topic}")
 
     def _centre_rad(self) -> Optional[float]:
-        """Return the angle by the odometry; None where a yaw rate tells none: it hardly moves."""
+        """Return the odometry's steering angle; None if the speed is too low for a yaw rate's."""
         angular, speed_mps = self._angular, self._heard.speed_mps
         if angular is None or self._is_angle:
             return angular
@@ -260,7 +260,7 @@ class Ros2Vehicle(streamed.StreamedVehicle):
 
     def _hear(self, sample: zenoh.Sample) -> None:
         if len(sample.payload) > MAX_PAYLOAD_BYTES:
-            return  # something huge is not even copied
+            return  # a huge message is not even copied
         odometry = read_odometry(sample.payload.to_bytes())
         if odometry is not None:
             with self._lock:
@@ -274,7 +274,7 @@ class Ros2Vehicle(streamed.StreamedVehicle):
         try:
             self._publish(twist_of(motion, self._angular, self._core.similarity.spec.wheelbase_m))
             fails = False
-        except Exception as error:  # the vehicle stops by its own time-out, and the silence tells
+        except Exception as error:  # the vehicle stops by its own time-out
             fails = True
             if not self._fails:
                 log.event("error", "ros2_not_sent", detail=error)
