@@ -1,4 +1,4 @@
-"""``python -m deploy``: prepare what goes onto the board, and bring it there."""
+"""``python -m deploy``: make keys, certificates and bundles, and install them on a board."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from edge_runtime.cli import program, run_cli
 COMMANDS = {
     "keys": ("deploy.certs:keys", "make a key pair that signs policies and bundles"),
     "certs": ("deploy.certs:certs", "make an authority and certificates for TLS"),
-    "policy": ("trainer.sb3:POLICY", "make a policy file of any ONNX model, or a model.zip"),
+    "policy": ("trainer.sb3:POLICY", "make a policy file from any ONNX model, or a model.zip"),
     "bundle": ("deploy.bundle:bundle", "make one signed archive for one board and vehicle"),
-    "push": ("deploy.bundle:push", "bring a bundle to a board and install it"),
+    "push": ("deploy.bundle:push", "copy a bundle to a board and install it"),
 }
 
 main = program(
     "python -m deploy",
-    "Prepare what goes onto the board, and bring it there.",
+    "Make keys, certificates and bundles, and install them on a board.",
     COMMANDS,
     "python -m deploy keys --out keys",
     "python -m deploy bundle --policy my.onnx --target jetpack5 --config edge.toml",

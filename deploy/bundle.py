@@ -1,6 +1,6 @@
-"""``python -m deploy bundle`` and ``push``: what a board needs to drive one policy, in one archive.
+"""``python -m deploy bundle`` and ``push``: all that a board needs for one policy, in one archive.
 
-The same inputs give the same bytes: the archive holds no time, place or user name. A lock names
+The same inputs give the same bytes: the archive holds no time, path or user name. A lock file names
 every wheel by version and hash; only the first bundle needs a network.
 """
 
@@ -45,8 +45,8 @@ from deploy.installer.__main__ import main
 sys.exit(main(sys.argv[1:]))
 """
 UNATTENDED = ("-o", "BatchMode=yes", "-o", "ConnectTimeout=10")
-"""A password asked for in the middle would hang a script, and so would a board without power."""
-TARGETS = {  # Python, processor, and the oldest C library
+"""Without them a password prompt, or a board without power, would hang a script."""
+TARGETS = {  # Python, processor, oldest glibc
     "jetpack5": ("3.8", "aarch64", "2.31"),  # Jetson Xavier NX: Ubuntu 20.04
     "linux-aarch64": ("3.9", "aarch64", "2.31"),  # Debian bullseye
     "linux-x86_64": ("3.8", "x86_64", "2.31"),  # jetpack5's versions on a workstation
@@ -72,59 +72,59 @@ def bundle(parser: argparse.ArgumentParser) -> None:
     add("--out", metavar="DIR", default=DEFAULT_OUT, help="folder for the bundle")
 
 
-def run_bundle(given: argparse.Namespace) -> int:
-    collect(given)  # What can be wrong is said before minutes of downloads.
+def run_bundle(arguments: argparse.Namespace) -> int:
+    collect(arguments)  # Reports errors before minutes of downloads.
     with tempfile.TemporaryDirectory() as place:
-        if given.wheels:  # pip refuses those that do not fit the target.
-            download(given.target, place, "--no-index", *map(str, given.wheels))
-        gather(given.target, place)
+        if arguments.wheels:  # pip refuses those that do not fit the target.
+            download(arguments.target, place, "--no-index", *map(str, arguments.wheels))
+        gather(arguments.target, place)
         edge_wheel = Path(place, f"phil_edge_runtime-{__version__}-py3-none-any.whl")
         edge_wheel.write_bytes(build_edge_wheel())
-        given.wheels = sorted(Path(place).iterdir())
-        path, manifest = make_bundle(given)
+        arguments.wheels = sorted(Path(place).iterdir())
+        path, manifest = make_bundle(arguments)
     print(f"{path}  ({path.stat().st_size / 1e6:.1f} MB), signed by {path.name}.sig")
     print(f"version {manifest.version}, for {manifest.vehicle_id}")
     return 0
 
 
-def make_bundle(given: argparse.Namespace) -> tuple[Path, Manifest]:
+def make_bundle(arguments: argparse.Namespace) -> tuple[Path, Manifest]:
     """Write `phil-TARGET-VEHICLE-VERSION.tar`, mode 0600, and its signature into `out`."""
-    contents, manifest = collect(given)
+    contents, manifest = collect(arguments)
     packed = pack(contents)
-    path = given.out / f"phil-{given.target}-{manifest.vehicle_id}-{manifest.version}.tar"
-    write_atomic(f"{path}.sig", sign(packed, tls.read_signing_key(given.key)))
+    path = arguments.out / f"phil-{arguments.target}-{manifest.vehicle_id}-{manifest.version}.tar"
+    write_atomic(f"{path}.sig", sign(packed, tls.read_signing_key(arguments.key)))
     write_private(path, packed)  # it holds a private key
     return path, manifest
 
 
-def collect(given: argparse.Namespace) -> tuple[dict[str, bytes], Manifest]:
-    """Return a bundle's files, by path, and its manifest. Raises UserError for what is wrong."""
-    tls.read_signing_key(given.key)
-    policy = load_policy(given.policy, given.public_key)
-    flags = {"policy": str(given.policy), "tls": given.tls and str(given.tls)}
-    config = load_config(given.config, flags)
-    if config.vehicle in BUILT_IN or not given.wheels:  # A driver in a wheel is not installed here.
+def collect(arguments: argparse.Namespace) -> tuple[dict[str, bytes], Manifest]:
+    """Check the options; return a bundle's files by path, and its manifest. Raises UserError."""
+    tls.read_signing_key(arguments.key)
+    policy = load_policy(arguments.policy, arguments.public_key)
+    flags = {"policy": str(arguments.policy), "tls": arguments.tls and str(arguments.tls)}
+    config = load_config(arguments.config, flags)
+    if config.vehicle in BUILT_IN or not arguments.wheels:  # A wheel's driver is not installed here
         limits = vehicle_limits(
             config.vehicle, config.vehicle_settings, policy.manifest, config.bounds
         )
         shared_limits(policy.manifest.action, limits)
     contents = {
         NAME: build_installer(),
-        release.POLICY: read_bytes(given.policy, "policy file", MAX_POLICY_MIB),
-        f"{release.POLICY}.sig": read_bytes(f"{given.policy}.sig", "signature"),
-        release.PUBLIC_KEY: read_bytes(given.public_key, "public key"),
-        release.CONFIG: _settings(given.config, given.tls is not None),
+        release.POLICY: read_bytes(arguments.policy, "policy file", MAX_POLICY_MIB),
+        f"{release.POLICY}.sig": read_bytes(f"{arguments.policy}.sig", "signature"),
+        release.PUBLIC_KEY: read_bytes(arguments.public_key, "public key"),
+        release.CONFIG: _settings(arguments.config, arguments.tls is not None),
         **{f"units/{path.name}": path.read_bytes() for path in (ROOT / "deploy/systemd").iterdir()},
     }
-    if given.tls is not None:  # The party's three files, and none that may stand beside them.
-        tls.check_name(tls.load_tls(given.tls).name, tls.common_name(tls.EDGE, config.vehicle_id))
+    if (folder := arguments.tls) is not None:  # The party's three files only
+        tls.check_name(tls.load_tls(folder).name, tls.common_name(tls.EDGE, config.vehicle_id))
         for name in (tls.CA_FILE, tls.CERTIFICATE_FILE, tls.KEY_FILE):
-            contents[f"{release.TLS}{name}"] = read_bytes(given.tls / name, "TLS file")
-    for path in given.wheels:  # Without the tags, which make some names too long for a tar.
+            contents[f"{release.TLS}{name}"] = read_bytes(folder / name, "TLS file")
+    for path in arguments.wheels:  # Without the tags, which make some names too long for a tar.
         package, version, *_ = path.name.split("-")
         contents[f"{release.WHEELS}{package}-{version}.whl"] = read_bytes(path, "wheel")
-    # The version ends with a hash of all the rest, so it always means the same bytes.
-    draft = Manifest("", config.vehicle_id, policy.policy_id, *TARGETS[given.target])
+    # The version ends with a hash of everything else, so it always names the same bytes.
+    draft = Manifest("", config.vehicle_id, policy.policy_id, *TARGETS[arguments.target])
     contents[release.MANIFEST] = json.dumps(draft._asdict()).encode()
     digest = hashlib.sha256(pack(contents)).hexdigest()
     manifest = draft._replace(version=f"{__version__}-{policy.policy_id[:8]}-{digest[:8]}")
@@ -133,16 +133,16 @@ def collect(given: argparse.Namespace) -> tuple[dict[str, bytes], Manifest]:
 
 
 def _settings(config: Path | None, with_tls: bool) -> bytes:
-    """Return the file that the board gets: the given settings behind those of the bundle."""
-    given = read_toml(config, "config file") if config else {}
-    if wrong := [name for name in given if name in _OF_THE_BUNDLE and given[name] is not False]:
+    """Return the board's settings file: the bundle's own settings, then those of ``config``."""
+    table = read_toml(config, "config file") if config else {}
+    if wrong := [name for name in table if name in _OF_THE_BUNDLE and table[name] is not False]:
         raise UserError(f"config file {config}: leave {', '.join(wrong)} to the bundle")
     lines = [
-        "# Made by `deploy bundle`; paths are of the release's folder, where the service starts.",
+        "# Made by `deploy bundle`; paths start at the release's folder, where the service runs.",
         f'policy = "{release.POLICY}"',
         f'public_key = "{release.PUBLIC_KEY}"',
         ""
-        if "armed_at_start" in given
+        if "armed_at_start" in table
         else "armed_at_start = false  # nobody sees a service start",
         f'tls = "{release.TLS}"' if with_tls else "",
         config.read_text("utf-8") if config else "",
@@ -162,7 +162,7 @@ def pack(contents: dict[str, bytes]) -> bytes:
 
 
 def sign(data: bytes, key: Ed25519PrivateKey) -> bytes:
-    """Make the signature that the board's `ssh-keygen -Y verify` takes; the same one each time."""
+    """Make the signature that the board's `ssh-keygen -Y verify` takes; it is deterministic."""
     kind, no_password = form.PrivateFormat.OpenSSH, form.NoEncryption()
     with tempfile.NamedTemporaryFile() as file:  # mode 0600
         file.write(key.private_bytes(form.Encoding.PEM, kind, no_password))
@@ -178,7 +178,7 @@ def build_installer() -> bytes:
 
 
 def build_edge_wheel() -> bytes:
-    """Make what the board imports of the edge runtime: packages only, for it is not installed."""
+    """Make a wheel of the edge runtime's packages, without metadata: pip does not install it."""
     folder = ROOT / "edge_runtime"
     return _zip([p for p in folder.rglob("*.py") if "tests" not in p.relative_to(folder).parts], {})
 
@@ -194,12 +194,12 @@ def _zip(sources: Sequence[Path], members: dict[str, str]) -> bytes:
 
 
 def lock_path(target: str) -> Path:
-    """The file that names every wheel of a target by version and hash, as pip reads it."""
+    """Return the lock file of a target: pip's list of every wheel by version and hash."""
     return ROOT / f"requirements/bundle-{target}.txt"
 
 
 def gather(target: str, place: str) -> None:
-    """Bring the lock's wheels to `place`; an index is asked only for those that are not kept."""
+    """Copy the lock file's wheels to `place`; download only those that are not kept."""
     kept = str(KEPT_WHEELS / target)
     locked = ("--require-hashes", "--requirement", str(lock_path(target)), "--find-links", kept)
     try:
@@ -210,7 +210,7 @@ def gather(target: str, place: str) -> None:
 
 
 def download(target: str, folder: str, *wanted: str) -> None:
-    """Let pip bring wheels for another computer. Raises UserError with pip's last line."""
+    """Download wheels for another computer by pip. Raises UserError with pip's last line."""
     python, machine, glibc = TARGETS[target]
     minors = range(int(glibc.split(".")[1]) + 1)
     tags = ["linux", *(f"manylinux{n}" for n in (1, 2010, 2014, *(f"_2_{m}" for m in minors)))]
@@ -239,28 +239,28 @@ def push(parser: argparse.ArgumentParser) -> None:
     add("--dry-run", action="store_true", help="print each command and do nothing")
 
 
-def run_push(given: argparse.Namespace) -> int:
+def run_push(arguments: argparse.Namespace) -> int:
     """Copy and install over ssh; return the first status that is not 0."""
-    # What the board would refuse is not sent.
-    manifest, _ = release.read_bundle(given.bundle, release.read_public_key(given.trust))
+    # Verified here, too: the board would refuse it only after the copy.
+    manifest, _ = release.read_bundle(arguments.bundle, release.read_public_key(arguments.trust))
     place = f"phil-push-{manifest.version}"
     install = ["sudo", "-n", f"python{manifest.python}", f"{place}/{NAME}", "install"]
-    install += [f"{place}/{given.bundle.name}", "--trust", f"{place}/{given.trust.name}"]
+    install += [f"{place}/{arguments.bundle.name}", "--trust", f"{place}/{arguments.trust.name}"]
     with tempfile.TemporaryDirectory() as folder:
-        # This workstation's own: what verifies the bundle must not come out of it.
+        # The workstation's own: the verifier must not come out of the bundle.
         installer = Path(folder, NAME)
         installer.write_bytes(build_installer())
-        # Absolute: scp would take "a:b" for a file of the host a.
-        files = (given.bundle, Path(f"{given.bundle}.sig"), given.trust, installer)
-        ssh = ["ssh", *UNATTENDED, "--", given.host]
+        # Absolute paths: scp reads "a:b" as a file of the host a.
+        files = (arguments.bundle, Path(f"{arguments.bundle}.sig"), arguments.trust, installer)
+        ssh = ["ssh", *UNATTENDED, "--", arguments.host]
         for command in (
             [*ssh, f"umask 077 && mkdir -p {place}"],
             ["scp", "-q", *UNATTENDED, "--", *(str(path.absolute()) for path in files),
-             f"{given.host}:{place}/"],
+             f"{arguments.host}:{place}/"],
             [*ssh, f"{shlex.join(install)}; s=$?; rm -rf {place}; exit $s"],
         ):  # fmt: skip
             print(shlex.join(command), flush=True)
-            if not given.dry_run:
+            if not arguments.dry_run:
                 done = subprocess.run(command, stdin=subprocess.DEVNULL, check=False)
                 if done.returncode != 0:
                     return done.returncode

@@ -1,7 +1,7 @@
-"""``python -m deploy keys`` and ``certs``: who may sign, and who may talk to whom.
+"""``python -m deploy keys`` and ``certs``: make signing keys and TLS certificates.
 
-A certificate's common name says which party it is; `edge_runtime.tls` holds what that may send and
-hear. Only parties that listen get a server's certificate: no viewer can pose as a simulator.
+A certificate's common name is its party; `edge_runtime.tls` holds the rights of each party. Only
+parties that listen get a server's certificate: no viewer can pose as a simulator.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def run_keys(arguments: argparse.Namespace) -> int:
 
 
 def write_key_pair(directory: Path) -> tuple[Path, Path]:
-    """Write `policy.key`, for the owner alone, and `policy.pub`; UserError where one is there."""
+    """Write `policy.key`, readable by its owner only, and `policy.pub`; UserError if one exists."""
     public_path = directory / DEFAULT_PUBLIC_KEY.name
     private_path = public_path.with_suffix(".key")
     if private_path.exists() or public_path.exists():
@@ -64,7 +64,7 @@ def write_key_pair(directory: Path) -> tuple[Path, Path]:
 
 
 def write_private(path: Path, data: bytes) -> None:
-    """Write a file that others cannot read, not even briefly: the umask, not a chmod."""
+    """Write a file that others can never read: by the umask, because a chmod comes too late."""
     before = os.umask(0o077)
     try:
         write_atomic(path, data)
@@ -136,7 +136,7 @@ def _host(text: str) -> x509.GeneralName:
 
 
 def _write_folder(folder: Path, authority: CertificatePair, files: dict[str, bytes]) -> None:
-    """Fill a draft, the owner's alone, and move it there: the folder is whole or absent."""
+    """Fill a private draft and rename it, so that the folder is whole or absent."""
     draft = folder.with_name(f".{folder.name}.{os.getpid()}")
     make_directory(folder.parent)
     try:
@@ -181,7 +181,7 @@ def issue(
         "data_encipherment": False, "key_agreement": False, "encipher_only": False,
         "decipher_only": False,
     }  # fmt: skip
-    # Each with whether a reader that does not know it must refuse the certificate.
+    # Extension, and whether it is critical: a reader that does not know it must refuse.
     extensions: list[tuple[x509.ExtensionType, bool]] = [
         (x509.BasicConstraints(ca=is_authority, path_length=0 if is_authority else None), True),
         (x509.KeyUsage(**uses), True),

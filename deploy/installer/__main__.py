@@ -1,8 +1,8 @@
 """`python3 install.pyz install | status | rollback | uninstall` (deploy/README.md).
 
-The order of steps is such that none can break a board. A release becomes `current` only when its
-files are whole, its policy may drive and it has passed its trial. Cut off at any moment, the board
-has the old release or the new one, and the same command again completes the work.
+No step can break a board. A release becomes `current` only when its files are whole, its policy may
+drive and it has passed its trial. Interrupted at any moment, the board has the old release or the
+new one, and the same command completes the work.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ def _run(argv: list[str]) -> int:
     service = choose(arguments.service, releases.root)
     if command == "status":
         return status(releases, service)
-    # A link that breaks must not end it between two releases; whoever ends it makes it go back.
+    # A lost ssh link must not end it between two releases; SIGINT and SIGTERM make it go back.
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    for one in SIGNALS:
-        signal.signal(one, signal.default_int_handler)
+    for number in SIGNALS:
+        signal.signal(number, signal.default_int_handler)
     try:
         if command == "install":
             install(releases, service, arguments.bundle, arguments.trust)
@@ -102,7 +102,7 @@ def status(releases: Releases, service: Systemd | None) -> int:
 
 
 def install(releases: Releases, service: Systemd | None, path: str, trust: str | None) -> None:
-    """Install or upgrade with the public key `trust`; first of all, the bundle is verified."""
+    """Verify a bundle with the public key `trust`, and install or upgrade it."""
     kept = releases.trusted.read_text(errors="replace") if releases.trusted.exists() else None
     key = release.read_public_key(trust) if trust is not None else kept
     if key is None:
@@ -123,26 +123,26 @@ def rollback(releases: Releases, service: Systemd | None) -> None:
     with releases.locked():
         version, before = releases.linked(PREVIOUS), releases.linked(BEFORE)
         if before and version != releases.linked(CURRENT):
-            version = before  # An upgrade was cut off. (A rollback that was is completed.)
+            version = before  # An upgrade was interrupted (an interrupted rollback is completed)
         if version is None or not releases.is_whole(version):
             raise UserError(f"{releases.root} holds no whole release to go back to")
         _activate(releases, service, version)
 
 
 def _activate(releases: Releases, service: Systemd | None, version: str) -> None:
-    """Prove a release and switch to it. UnhealthyError where the board stays or is as before."""
+    """Prove a release and switch to it. UnhealthyError: the board has its old release."""
     _prove(releases.folder(version), service)
     releases.prepare()
     if service is None:
         releases.link(CURRENT, version)
     else:
         _switch(releases, service, version)
-    if releases.linked(BEFORE) != version:  # It is where `rollback` goes from now on.
+    if releases.linked(BEFORE) != version:  # `rollback` goes there from now on.
         releases.move(BEFORE, PREVIOUS)
 
 
 def _prove(folder: Path, service: Systemd | None) -> None:
-    """`edge_runtime check` by the release's own runtime, then its trial; or UnhealthyError."""
+    """Run the release's own `edge_runtime check`, then its trial. Raises UnhealthyError."""
     command = ["check", release.POLICY, "--public-key", release.PUBLIC_KEY]
     launcher = str(folder / release.LAUNCHER)
     done = subprocess.run([launcher, *command], cwd=folder, capture_output=True, text=True)
@@ -153,18 +153,18 @@ def _prove(folder: Path, service: Systemd | None) -> None:
 
 
 def _switch(releases: Releases, service: Systemd, version: str) -> None:
-    """Stop, switch and start; whatever goes wrong, start what was good."""
+    """Stop, switch and start; on any failure, start the last good release again."""
     good = releases.linked(BEFORE)
     try:
         service.stop()
-        # Units first: `choose` knows by them who runs an installation that was cut off.
+        # Units first: by them `choose` sees that systemd runs an interrupted installation.
         service.prepare(releases.folder(version))
         releases.link(CURRENT, version)
         service.start()
     except BaseException as error:
-        for one in SIGNALS:  # A second signal would leave the board without a service.
-            signal.signal(one, signal.SIG_IGN)
-        with contextlib.suppress(Exception):  # What does not stop is still replaced.
+        for number in SIGNALS:  # A second signal would leave the board without a service.
+            signal.signal(number, signal.SIG_IGN)
+        with contextlib.suppress(Exception):  # A service that does not stop is still replaced.
             service.stop()
         if releases.linked(CURRENT) != good:
             releases.move(BEFORE, CURRENT)

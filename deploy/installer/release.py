@@ -1,22 +1,22 @@
-"""Read a signed bundle, and lay it out as a release that no power cut can leave half-made.
+"""Read a signed bundle, and unpack it as a release that no power cut can leave half-made.
 
 BUNDLE.tar.sig is the signature of `ssh-keygen -Y sign` over the whole BUNDLE.tar, so a changed byte
-is found before anything inside is looked at.
+is found before anything inside is read.
 
-ROOT/trusted.pub             the key that this board trusts, in OpenSSH's form; never of a bundle
-ROOT/releases/VERSION/       whole releases only; the one installer at work locks the folder
+ROOT/trusted.pub             the key that this board trusts, in OpenSSH's form; never from a bundle
+ROOT/releases/VERSION/       whole releases only; a running installer locks the folder
 ROOT/current  -> releases/V  the release that the service runs
 ROOT/previous -> releases/V  the release that `rollback` goes back to
 ROOT/.before  -> releases/V  during a switch: the release that was current before it
 
-Each link changes by one rename. A release that no link names is removed; a folder is one only with
-its contents.json. All else in ROOT stays.
+Each link changes by one rename. A release that no link names is removed; a folder without
+contents.json is no release. Everything else in ROOT stays.
 
 A release holds the bundle's files, and
 
 site-packages/               its wheels, unpacked and compiled
 bin/phil-edge                starts the runtime with these packages and the installer's Python
-contents.json                the SHA-256 of every file, by which a release is known to be whole
+contents.json                the SHA-256 of every file, to check that the release is whole
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from edge_runtime.util import PathLike, UserError, read_bytes
 
 DEFAULT_ROOT = "/opt/phil"
 NAMESPACE = "phil-bundle"
-"""A signature over anything else, with the same key, does not pass for a bundle's."""
+"""So that a signature of something else by the same key is not valid for a bundle."""
 MANIFEST, CONFIG, WHEELS, TLS = "manifest.json", "config.toml", "wheels/", "tls/"
 POLICY, PUBLIC_KEY = "policy.onnx", "policy.pub"
 SITE, LAUNCHER, CONTENTS = "site-packages", "bin/phil-edge", "contents.json"
@@ -71,9 +71,9 @@ runpy.run_module("edge_runtime", run_name="__main__")
 
 
 class Manifest(NamedTuple):
-    """What a bundle says of itself; it runs with this Python ("3.8"), and this glibc or newer."""
+    """A bundle's description; it runs with this Python ("3.8"), and this glibc or a newer one."""
 
-    version: str  # It names these bytes and no others.
+    version: str  # Unique to these bytes
     vehicle_id: str
     policy_id: str
     python: str
@@ -82,7 +82,7 @@ class Manifest(NamedTuple):
 
 
 def read_bundle(path: PathLike, trusted: str) -> tuple[Manifest, dict[str, bytes]]:
-    """Read a bundle once; UserError where the owner of the key `trusted` has not signed it."""
+    """Read a bundle once; UserError unless the key `trusted` has signed it."""
     data = read_bytes(path, "bundle", _MAX_BUNDLE_MIB)
     with tempfile.NamedTemporaryFile("w") as signers:
         signers.write(f"owner {trusted}\n")
@@ -91,8 +91,8 @@ def read_bundle(path: PathLike, trusted: str) -> tuple[Manifest, dict[str, bytes
                    "-n", NAMESPACE, "-s", f"{path}.sig"]  # fmt: skip
         done = subprocess.run(command, input=data, capture_output=True, check=False)
     if done.returncode != 0:
-        said = done.stderr.decode(errors="replace")
-        raise UserError(f"bundle {path} was changed, or its signer is not trusted here ({said})")
+        why = done.stderr.decode(errors="replace")
+        raise UserError(f"bundle {path} was changed, or its signer is not trusted here ({why})")
     files = {}
     try:
         with tarfile.open(fileobj=io.BytesIO(data), mode="r:") as tar:
@@ -107,7 +107,7 @@ def read_bundle(path: PathLike, trusted: str) -> tuple[Manifest, dict[str, bytes
 
 
 def read_public_key(path: PathLike) -> str:
-    """Read an Ed25519 key in PEM; return it as OpenSSH has it. UserError for anything else."""
+    """Read an Ed25519 key in PEM; return it in OpenSSH's form. UserError for anything else."""
     pem = read_bytes(path, "public key")
     try:
         der = base64.b64decode(re.sub(rb"-----(BEGIN|END) PUBLIC KEY-----", b"", pem))
@@ -145,7 +145,7 @@ class Releases:
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
-        """Be the only installer here; before and after, remove what no link names."""
+        """Lock out other installers; before and after, remove releases that no link names."""
         for link in (self.root / name for name in LINKS):
             if link.exists() and not link.is_symlink():
                 raise UserError(f"{link} is no link of an installation; move it away")
@@ -169,12 +169,12 @@ class Releases:
                 shutil.rmtree(path, ignore_errors=True)
 
     def prepare(self) -> None:
-        """Note what is current: going back is then one rename, which needs no room on the disk."""
-        if not os.path.lexists(self.root / BEFORE):  # There is one already after a cut-off switch.
-            self.link(BEFORE, str(self.linked(CURRENT)))  # "None", which no release is called
+        """Note the current release: going back is then one rename, which needs no disk space."""
+        if not os.path.lexists(self.root / BEFORE):  # An interrupted switch has left one.
+            self.link(BEFORE, str(self.linked(CURRENT)))  # "None" is the name of no release
 
     def link(self, name: str, version: str) -> None:
-        """Let a link name a release, by one rename."""
+        """Point a link to a release, by one rename."""
         self._unlink(".next")  # of an installer that was killed
         os.symlink(f"releases/{version}", self.root / ".next")
         self.move(".next", name)
@@ -187,12 +187,12 @@ class Releases:
         (self.root / name).unlink(missing_ok=True)
 
     def is_whole(self, version: str) -> bool:
-        """Whether no file of a release is missing, changed or too many."""
+        """Return whether no file of a release is missing, changed or added."""
         path = self.folder(version) / CONTENTS
         return path.exists() and path.read_bytes() == _contents(path.parent)
 
     def unpack(self, version: str, files: dict[str, bytes]) -> None:
-        """Make a release of a bundle's files: it gets its name when all of it is on the disk."""
+        """Make a release of a bundle's files; rename it once everything is on the disk."""
         folder = self.folder(version)
         draft = folder.with_name(DRAFT)
         draft.mkdir(mode=0o700)
@@ -208,7 +208,7 @@ class Releases:
         launcher.parent.mkdir()
         launcher.write_text(_LAUNCH.format(python=sys.executable, packages=str(folder / SITE)))
         launcher.chmod(0o755)
-        # Now, because the service may not write here, and compiling at each start takes seconds.
+        # Here, because the service may not write, and compiling at each start takes seconds.
         compileall.compile_dir(draft / SITE, quiet=2)
         (draft / CONTENTS).write_bytes(_contents(draft))
         draft.chmod(0o755)
@@ -224,7 +224,7 @@ class Releases:
             self._unlink(name)
         self._tidy()
         self._unlink(self.trusted.name)
-        with contextlib.suppress(OSError):  # What else lies there stays.
+        with contextlib.suppress(OSError):  # Folders with other files stay.
             self._releases.rmdir()
             self.root.rmdir()
 
@@ -239,7 +239,7 @@ def _contents(folder: Path) -> bytes:
 
 
 def unpack_wheel(data: bytes, site: Path) -> None:
-    """Write a wheel's packages into `site`; a board may lack pip. Scripts and data stay out."""
+    """Write a wheel's packages into `site`, without scripts and data; a board may lack pip."""
     with zipfile.ZipFile(io.BytesIO(data)) as wheel:
         for member in wheel.infolist():
             folder, _, rest = member.filename.partition("/")

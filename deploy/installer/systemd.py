@@ -1,7 +1,7 @@
-"""Run a release as a systemd service, and try it before.
+"""Run a release as a systemd service, after a trial.
 
-A trial is the release's own runtime, policy, settings, certificates and user, without a vehicle,
-in a network of its own.
+A trial runs the release's own runtime, policy, settings and certificates as the service's user, but
+without a vehicle and in a network of its own.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from edge_runtime.util import UserError
 MAIN_UNIT, CAN_UNIT, TRIAL_UNIT = "phil-edge.service", "phil-can.service", "phil-trial.service"
 USER = "phil"
 READY_S, SETTLE_S = 30.0, 3.0
-"""How soon a trial must be ready, and how long a release must then stay healthy."""
+"""Limit until a trial is ready, and time for which a release must then stay healthy."""
 UNIT_FOLDER = Path("/etc/systemd/system")
 BOOTED = Path("/run/systemd/system")
-"""A folder where systemd runs this computer (sd_booted(3))."""
+"""Exists where systemd runs this computer (sd_booted(3))."""
 
 
 class UnhealthyError(UserError):
@@ -37,13 +37,13 @@ class Systemd:
         self._root = root
 
     def group(self) -> int:
-        """Return the id of the user's group. Make the user where it is missing."""
+        """Return the id of the user's group; make the user if it is missing."""
         options = ("--system", "--no-create-home", "--shell", "/usr/sbin/nologin")
         _run("useradd", *options, USER, check=False)
         return pwd.getpwnam(USER).pw_gid
 
     def try_release(self, folder: Path) -> None:
-        """Run a release heard by nobody, and give the user's group its TLS key. UnhealthyError."""
+        """Give the user's group the TLS key, and run a trial. Raises UnhealthyError."""
         protocol, group = "tcp", self.group()
         for path in (folder / TLS).glob("*"):
             protocol = "tls"
@@ -61,7 +61,7 @@ class Systemd:
                 "StandardError": f"file:{log}",
                 "TimeoutStartSec": READY_S,
                 "WatchdogSec": SETTLE_S / 3,
-                # It ends by itself, should the installer be killed.
+                # The trial ends by itself if the installer is killed.
                 "RuntimeMaxSec": 2 * (READY_S + SETTLE_S),
             }
             _run("systemctl", "stop", TRIAL_UNIT, check=False)  # of an installer that was killed
@@ -111,7 +111,7 @@ class Systemd:
 def choose(service: str | None, root: Path) -> Systemd | None:
     """Return the service of `--service`, None where somebody else runs the release.
 
-    Without the option an installation stays as it is, and a first one takes systemd where it runs.
+    Without the option an installation stays as it is, and a first one uses systemd if it runs.
     """
     has_unit = (UNIT_FOLDER / MAIN_UNIT).exists()
     if service == "none" and has_unit:
@@ -121,7 +121,7 @@ def choose(service: str | None, root: Path) -> Systemd | None:
 
 
 def _require_active(unit: str) -> None:
-    """Raise UnhealthyError where a unit that was just started has ended or begun anew by then."""
+    """Raise UnhealthyError if a unit that was just started has ended or restarted by then."""
     time.sleep(SETTLE_S)
     shown = _run("systemctl", "show", unit, "--property=ActiveState,NRestarts,Result").split()
     if not {"ActiveState=active", "NRestarts=0"} <= set(shown):
