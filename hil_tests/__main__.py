@@ -1,4 +1,4 @@
-"""``python -m hil_tests``: the loop, proven without hardware."""
+"""``python -m hil_tests``: prove the loop without hardware."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("hil_tests.demo", "train, export and drive the left turn, end to end"),
     "accept": (
         "hil_tests.commands:accept",
-        "judge whether a policy may drive a vehicle over a network: one page, one verdict",
+        "check whether a policy may drive a vehicle over a network; write a one-page verdict",
     ),
     "campaign": (
         "hil_tests.commands:campaign",
         "inject every fault, test every simulated network, and write a report",
     ),
-    "envelope": ("hil_tests.commands:envelope", "find the networks that a policy can bear"),
+    "envelope": ("hil_tests.commands:envelope", "find the worst networks that a policy can bear"),
     "mock_hunter": ("hil_tests.mock_hunter", "run a mock Hunter on a CAN bus, with its faults"),
     "conformance": ("hil_tests.conformance", "test a vehicle's driver against the safety rules"),
 }
 
 
-main = program("python -m hil_tests", "Proves the loop.", COMMANDS, "python -m hil_tests demo")
+main = program("python -m hil_tests", "Prove the loop.", COMMANDS, "python -m hil_tests demo")
 
 if __name__ == "__main__":
     sys.exit(run_cli(main))

@@ -1,7 +1,7 @@
-"""``python -m hil_tests campaign``: every fault, and every network of the axes, in one report.
+"""``python -m hil_tests campaign``: inject every fault, test every network, and write a report.
 
-The report is JSON, Markdown and a picture. Along each axis one thing about the network gets worse,
-each way, with the same seeds and in virtual time.
+The report is JSON, Markdown and a picture. Each axis worsens one property of the network, each way,
+with the same seeds and in virtual time.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from hil_tests.faults.run import ROWS, run_faults
 from trainer.util import cores, kept
 
 Found = Mapping[str, Any]  # A part of a report's JSON
-TARGET = 0.98  # Share of successes that a network within the budget leaves
+TARGET = 0.98  # Success that a network within the budget must allow
 
 
 class Axis(NamedTuple):
@@ -45,7 +45,7 @@ class Axis(NamedTuple):
 
 
 _LATE = "delay=100ms"
-"""What jitter is measured on: without delay, half of it would be cut off at zero."""
+"""Delay below the jitter axes: without it, half of the jitter would be cut off at zero."""
 _MS = (0, 10, 20, 40, 60, 80, 100)
 AXES = (
     Axis("delay", "delay each way", "ms",
@@ -64,9 +64,9 @@ AXES = (
 )  # fmt: skip
 
 
-@sigterm_as_interrupt()  # whoever ends a campaign ends its processes
+@sigterm_as_interrupt()  # so that a campaign that is ended ends its processes
 def run(arguments: argparse.Namespace) -> int:
-    """Run both parts or one; return 0, or 1 where a fault was not met as it should be."""
+    """Run both parts or one; return 1 if a fault was missed, else 0."""
     out = Path(arguments.out)
     markdown, picture = out.with_suffix(".md"), out.with_name(f"{out.stem}_success.png")
     check_writable(out)
@@ -100,9 +100,9 @@ def choose(names: str | None, only: str | None) -> tuple[list[Axis], list[Row]]:
     axes, faults = AXES if only != "faults" else (), ROWS if only != "latency" else ()
     known, chosen = [row.name for row in (*axes, *faults)], set[str]()
     for name in names.split(",") if names else ["*"]:
-        if not (found := fnmatch.filter(known, name)):
+        if not (matches := fnmatch.filter(known, name)):
             raise UserError(f"there is no {name!r}; choose from {', '.join(known)}")
-        chosen.update(found)
+        chosen.update(matches)
     wanted = [axis for axis in axes if axis.name in chosen]
     return wanted, [row for row in faults if row.name in chosen]
 
@@ -160,9 +160,9 @@ def run_latency(
 
 
 def budget(axes: Sequence[Axis], rows: Found, name: str) -> dict[str, Any]:
-    """Return each axis's limit, and a sentence of them.
+    """Return each axis's limit, and a sentence with all limits.
 
-    A limit is the largest value up to which every tested one is at the target; None: not even 0.
+    A limit is the largest value up to which all tested ones reach the target; None: not even 0.
     """
     limits, parts = {}, []
     for axis in axes:
@@ -171,8 +171,8 @@ def budget(axes: Sequence[Axis], rows: Found, name: str) -> dict[str, Any]:
         limit = max((value for value, _ in holds), default=None)
         limits[axis.name] = limit
         most = " (the most that was tested)" if limit == axis.values[-1] else ""
-        found = f"{limit:g} {axis.unit}" if limit is not None else "not even 0"
-        parts.append(f"{found}{most} of {axis.title}")
+        value = f"{limit:g} {axis.unit}" if limit is not None else "not even 0"
+        parts.append(f"{value}{most} of {axis.title}")
     sentence = f"{name} holds at least {100 * TARGET:g}% success up to {'; '.join(parts)}. "
     return {"target_success": TARGET, "limits": limits, "sentence": f"{sentence}One at a time."}
 

@@ -1,4 +1,4 @@
-"""Options of the commands whose work loads torch: --help need not wait for it."""
+"""Options of the commands whose modules load torch: so --help does not wait for it."""
 
 import argparse
 
@@ -55,12 +55,12 @@ def accept(parser: argparse.ArgumentParser) -> None:
     add("--policy", required=True, metavar="P.onnx", type="path", help="policy file to judge")
     add_trust(parser)
     add("--env", required=True, help="scenario, gymnasium id or MODULE:ID")
-    driver = "its driver is tried and driven, as by `edge_runtime run`: lift the wheels (default: "
-    driver += "none)"
+    driver = "vehicle whose driver is tested and driven, as by `edge_runtime run`: lift the wheels "
+    driver += "(default: none)"
     add("--vehicle", metavar="NAME", help=driver)
-    link = "the network that it is to drive over, such as 50ms+-10ms,loss=1%%"
+    link = "network that the policy is to drive over, such as 50ms+-10ms,loss=1%%"
     add("--link", metavar="SPEC", type=parse_spec, default="none", help=link)
-    board = "measure the inference time there, by ssh (default: here)"
+    board = "measure the inference time on this board, by ssh (default: here)"
     add("--board", metavar="USER@HOST", help=board)
     settings = "thresholds (hil_tests/accept/accept.toml explains them)"
     add("--config", metavar="accept.toml", type="path", help=settings)

@@ -1,7 +1,7 @@
-"""``python -m hil_tests conformance``: a vehicle's driver against the rules that stop it.
+"""``python -m hil_tests conformance``: test a vehicle's driver against the safety rules.
 
-The driver is real, and so is the clock; what it moves may be a mock. It is called as the edge
-runtime calls it: by one thread. It will drive, with each action at its highest: lift the wheels.
+The driver and the clock are real; the vehicle may be a mock. As in the edge runtime, one thread
+calls the driver. The vehicle will drive, with each action at its highest: lift the wheels.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from edge_runtime.util import UserError, printable
 from edge_runtime.vehicles import make_vehicle
 from edge_runtime.vehicles.base import Vehicle, VehicleReport, close_in_time
 
-LATE_S = 0.05  # what a driver may be late, besides a fifth of T
-CALL_S = 0.05  # a call that takes longer holds back the runtime's feedback
+LATE_S = 0.05  # allowed lateness of a driver, besides a fifth of T
+CALL_S = 0.05  # a longer call would delay the runtime's feedback
 MOVES_MPS, STANDS_MPS = 0.1, 0.05
 ROUNDING = 1e-3
-PATIENCE_S = 10.0  # until it moves, or stands
+PATIENCE_S = 10.0  # limit until the vehicle moves, or stands
 EXAMPLE = examples(
     "python -m hil_tests conformance --vehicle mock",
     "python -m hil_tests conformance --vehicle my_vehicle:Rover --config edge.toml",
@@ -37,12 +37,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--vehicle", metavar="NAME|MODULE:CLASS", help="the driver (default: that of --config)")
     add("--config", metavar="FILE.toml", help="its settings, as for `edge_runtime run`")
-    add("--out", metavar="R.json", type=check_writable, help="write what breaks each rule, as JSON")
+    add("--out", metavar="R.json", type=check_writable, help="write the report to this file")
     add("--period-s", type=float, default=0.1, metavar="S", help="the policy's control period T")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print a line for each rule; return 0 where the driver keeps all, 1 where it breaks one."""
+    """Print a line for each rule; return 0 if the driver keeps all, 1 if it breaks one."""
     flags = {"policy": "any", "vehicle": arguments.vehicle}
     config = load_config(arguments.config, flags, opens_link=False)
     if config.vehicle == NONE:
@@ -55,13 +55,13 @@ def run(arguments: argparse.Namespace) -> int:
         for rule, is_kept in RULES.items():
             try:
                 wrong = "" if is_kept(bench) else f"last report: {in_words(bench.last)}"
-            # A driver may raise anything, and the next rule is due.
+            # A driver may raise anything; the next rule is tried all the same.
             except (Exception, SystemExit) as error:
                 wrong = f"{type(error).__name__}: {error}"
             rules[rule] = printable(wrong)
             print(f"broken  {rule}: {rules[rule]}" if wrong else f"kept    {rule}", flush=True)
     finally:
-        close_in_time(vehicle)  # the last rule does, where it came so far
+        close_in_time(vehicle)  # the last rule has closed it, if it was reached
         log.close()
     kept = list(rules.values()).count("")
     write_json_out(arguments.out, {"vehicle": vehicle.name, "rules": rules})
@@ -88,7 +88,7 @@ class Bench:
             self.longest_s = max(self.longest_s, time.monotonic() - now_s)
 
     def report(self, after_s: float = 0.0) -> VehicleReport:
-        """Return its report, after a time in which it is asked for nothing else."""
+        """Return the vehicle's report, after ``after_s`` in which no command is sent."""
         end_s = time.monotonic() + after_s
         while time.monotonic() < end_s:
             self.call("feedback")
@@ -100,7 +100,7 @@ class Bench:
         return report
 
     def until(self, moves: bool, limit_s: float = PATIENCE_S, commands: bool = False) -> bool:
-        """Return whether it comes to move, or to stand; ``commands``: told to go each T."""
+        """Return whether the vehicle begins to move, or to stand; ``commands``: drive each T."""
         end_s, next_s = time.monotonic() + limit_s, -math.inf
         while True:
             now_s = time.monotonic()
@@ -118,7 +118,7 @@ class Bench:
         return self.until(moves=True, limit_s=limit_s, commands=True)
 
     def starts(self) -> bool:
-        """Return whether commands move it after `enable`, from a stand."""
+        """Enable the vehicle; return whether commands move it from a stand."""
         self.call("enable")
         return self.until(moves=False) and self.goes()
 
@@ -127,13 +127,13 @@ class Bench:
         return not self.until(moves=True, limit_s=0.5)
 
     def brakes_alone(self, periods: float) -> bool:
-        """Return whether it says that it brakes by itself, so many T after a last command."""
+        """Return whether it reports self-braking so many T after a last command."""
         self.call("command", self.go)
         return bool(self.report(periods * self.period_s).self_braking)
 
     def brakes(self) -> bool:
         self.call("brake")
-        # Commands still come: without them it would brake by itself.
+        # Commands go on: without them it would brake by itself.
         if self.until(moves=False, limit_s=2 * self.period_s + LATE_S, commands=True):
             return True
         before_mps, after_mps = (abs(self.report(LATE_S).speed_mps) for _ in range(2))
@@ -163,15 +163,15 @@ class Bench:
         self.stands_for_now()
         self.call("close")
         self.call("close")
-        with contextlib.suppress(Exception):  # what is closed may say so
+        with contextlib.suppress(Exception):  # a closed driver may raise
             return not self.goes(limit_s=1.0)
         return True
 
 
-# In this order, because one begins where another ends.
+# In this order, because each rule begins in the state that the one before leaves.
 RULES: dict[str, Callable[[Bench], bool]] = {
     "each action has a range": lambda it: (
-        bool(it.go) and all(one.low < one.high for one in it.vehicle.limits.values())
+        bool(it.go) and all(limit.low < limit.high for limit in it.vehicle.limits.values())
     ),
     "no command moves it before `enable`": lambda it: not it.goes(5 * it.period_s),
     "enabled, it stands until the first command": Bench.waits,

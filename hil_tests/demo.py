@@ -1,4 +1,4 @@
-"""The whole story in one command: a human's guidance, a policy, a board, a network, a picture."""
+"""Train with a human's guidance, export, drive over a network, record: all in one command."""
 
 from __future__ import annotations
 
@@ -16,31 +16,31 @@ from edge_runtime.util import read_json
 from hil_tests.processes import Process, operator, run_command
 
 VEHICLE_ID, LATENCY = "demo01", "50ms+-10ms"
-GOOD_SUCCESS = 0.8  # What the drives without latency should reach
+GOOD_SUCCESS = 0.8  # Success that the drives without latency should reach
 RUNS, RECORDED_RUNS = 20, 2
 HUMAN = ("--episodes", 40, "--max-minutes", 2.5, "--refining-updates", 1000)
 TRAINING = ("--steps", 1500, "--max-minutes", 4.5)
-"""With them, a demo takes nine minutes at most, on a slow machine, too."""
+"""With these limits a demo takes nine minutes at most, even on a slow machine."""
 SETTINGS = (
     "batch_size=64", "evaluate_every_steps=500", "evaluation_runs=30",
-    # Within so few steps a fast actor learns more than it unlearns.
+    # In so few steps, a fast actor gains more than it forgets.
     "actor_learning_rate=5e-4", "cloning_weight=20",
 )  # fmt: skip
 EXAMPLE = examples("python -m hil_tests demo --out runs/demo")
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    out = "directory of all it makes; a policy, model or training that is there is used"
+    out = "output directory; a policy, model or training in it is used again"
     parser.add_argument("--out", default="demo", help=out)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Train or take what is kept, drive, show; 1 where the policy misses too many goals."""
+    """Train (or use a kept policy), drive, print; return 1 if too few drives reach the goal."""
     began_s, folder = time.monotonic(), Path(arguments.out)
     make_directory(folder)
     policy, public_key = folder / "left_turn.onnx", folder / "keys" / "policy.pub"
     if Path(f"{policy}.sig").exists():
-        print(f"Using the policy that is kept in {folder}/; with another --out it trains anew.")
+        print(f"Using the policy in {folder}/; name another --out to train anew.")
     else:
         train(folder)
         print("\n3  The actor becomes a signed policy file")
@@ -61,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def train(folder: Path) -> None:
-    """Train the human model and PHIL-TD3 with its guidance; go on where that was cut off."""
+    """Train the human model and PHIL-TD3 with its guidance; resume an interrupted training."""
     human_dir, run_dir = folder / "human", folder / "run"
     if not (human_dir / "human.json").exists():  # It is written last.
         print("\n1  A person drives and takes over; the human model learns to imitate that")
@@ -70,12 +70,12 @@ def train(folder: Path) -> None:
     print("\n2  PHIL-TD3 learns to drive; the human model takes over when it must")
     settings = [word for setting in SETTINGS for word in ("--set", setting)]
     settings += ["--resume"] * (run_dir / "config.json").exists()
-    told = ("--human", human_dir, "--seed", 1, *TRAINING, *settings)
-    run_command("trainer", "train", "--out", run_dir, *told)
+    words = ("--human", human_dir, "--seed", 1, *TRAINING, *settings)
+    run_command("trainer", "train", "--out", run_dir, *words)
 
 
 def drive(folder: Path, trust: tuple[str, ...]) -> dict[str, dict[str, Any]]:
-    """Drive the same episodes in process, over the wire and over a slow one (reports); record."""
+    """Drive the same episodes in process, over the wire, and with latency; return the reports."""
 
     def simulate(name: str, runs: int, clock: str, latency: str, *view: object) -> dict[str, Any]:
         out, endpoint, us = folder / f"{name}.json", free_endpoint(), ("--vehicle-id", VEHICLE_ID)

@@ -1,7 +1,7 @@
 """``python -m hil_tests envelope``: find the smallest networks that break a policy.
 
 Each axis is searched alone, then all together. A point is driven until a sequential test has
-decided, in process and in virtual time, which is the drive over the wire to the bit
+decided, in process and in virtual time, which equals the drive over the wire to the bit
 (`tests/test_loop.py`). Every point drives the same seeds.
 """
 
@@ -37,19 +37,19 @@ from trainer.util import cores, die_with_parent, fitting, kept, set_threads
 HOLDS, BREAKS, BETWEEN = "holds", "breaks", "between"
 CONFIDENCE = 0.95  # Of a statement about an axis
 ZONE = 0.7
-"""The test tells the promise from 0.7 times more, and 0.7 times fewer, failures: for 95 %, from
-98.5 % and from 91.5 %."""
-TRIES = 8  # So many points an axis tries, about; the error of each is that much smaller
-MOST_FAILURES = 50  # At the promise: a point is left undecided after the drives that have so many
+"""The test distinguishes the promise from 0.7 times more, and 0.7 times fewer, failures: 95 % from
+91.5 % and from 98.5 %."""
+TRIES = 8  # About the number of points on an axis; the error of each is that much smaller
+MOST_FAILURES = 50  # A point is left undecided after the drives that have so many at the promise
 PANELS = 3  # In a row of a picture
-AT_ONCE = 16  # Drives between two looks at whether a point is decided
+AT_ONCE = 16  # Drives between two checks whether a point is decided
 OUTAGE_EVERY_S, OUTAGE_START_S = 3.0, 0.97  # Off the ticks, so that rounding decides nothing
 BURST_PERCENT = 5.0  # Share of the messages in bad stretches
-JITTER_FLOOR = 2.0  # Delay below so many standard deviations of jitter would be cut at zero
-SHARES = 20  # Steps of all limits together, from none to each in full
+JITTER_FLOOR = 2.0  # The least delay, in standard deviations of the jitter, which zero would cut
+SHARES = 20  # Steps of all axes together, from 0 to every limit in full
 
 AXES = {
-    "delay_ms": (1000.0, 10.0),  # One way, each way; so is all below
+    "delay_ms": (1000.0, 10.0),  # Each way, as all below
     "jitter_ms": (200.0, 5.0),  # Standard deviation, normal
     "tail_jitter_ms": (200.0, 5.0),  # The same, Pareto
     "loss_percent": (50.0, 1.0),  # Independent
@@ -63,13 +63,13 @@ class Tried(TypedDict):
     verdict: str
     drives: int
     successes: int
-    at: dict[str, float]  # Its point, without zeros
+    at: dict[str, float]  # The point, without zeros
 
 
 Point = Mapping[str, float]  # Axis -> value; 0 where it is missing
 Ray = Callable[[int], Point]  # The point of a step; 0 is a perfect network
 Drive = Callable[[LatencySpec, Sequence[int]], Sequence[bool]]
-"""Drives these seeds behind a network; for each, whether it succeeded."""
+"""Drives these seeds behind a network; returns the success of each."""
 
 
 def network(at: Point) -> LatencySpec:
@@ -87,7 +87,7 @@ def network(at: Point) -> LatencySpec:
 
 
 class SequentialTest:
-    """Decides by few drives whether the share of successes is above or below a promise.
+    """Decides with few drives whether the success rate is above or below a promise.
 
     Two of Wald's sequential probability ratio tests (1945, Sequential tests of statistical
     hypotheses, Annals of Mathematical Statistics 16(2)) on the same drives, as Sobel and Wald
@@ -120,7 +120,7 @@ class SequentialTest:
 
 
 class Search:
-    """Looks for edges, and hands the verdict of every point that was tried to ``keep``.
+    """Searches for edges; calls ``keep`` after each point, whose verdict is in ``tried``.
 
     ``drive`` is called with the next AT_ONCE seeds, from ``seed`` on, until a point is decided.
     """
@@ -149,12 +149,12 @@ class Search:
         return self.tried[str(spec)]["verdict"]
 
     def edge(self, ray: Ray, most: int) -> dict[str, Any]:
-        """Return the largest step that holds, the smallest beyond it that breaks, both networks.
+        """Return the largest step that holds and the smallest beyond that breaks, as networks, too.
 
-        None where none breaks.
+        The latter is None if none breaks.
         """
         inside = self._bisect(ray, 0, most, (HOLDS,))[0]
-        if inside > 1 and self.verdict(ray(inside // 2)) != HOLDS:  # Less may be worse.
+        if inside > 1 and self.verdict(ray(inside // 2)) != HOLDS:  # A milder one may be worse
             inside = self._bisect(ray, 0, inside // 2, (HOLDS,))[0]
         beyond = self._bisect(ray, inside, most, (HOLDS, BETWEEN))[1]
         outside = beyond if beyond <= most else None
@@ -162,7 +162,7 @@ class Search:
         return {**found, "outside": None if outside is None else str(network(ray(outside)))}
 
     def _bisect(self, ray: Ray, low: int, most: int, is_low: tuple[str, ...]) -> tuple[int, int]:
-        """Return neighbours of which the lower is low; the most is tried first, ``low`` never."""
+        """Return neighbouring steps, the lower with a verdict in ``is_low``; try ``most`` first."""
         middle, high = most, most + 1
         while high - low > 1:
             low, high = (middle, high) if self.verdict(ray(middle)) in is_low else (low, middle)
@@ -171,10 +171,10 @@ class Search:
 
 
 def find_edges(search: Search) -> dict[str, dict[str, Any]]:
-    """Return for each axis ``limit``, ``breaks_at`` and their networks; so for all together.
+    """Return ``limit``, ``breaks_at`` and their networks for each axis, and for all together.
 
     Together, the values are shares of the limits, with the jitter whose limit is smaller. Raises
-    UserError where the promise is not kept without a network.
+    UserError if the promise is not kept on a perfect network.
     """
     if search.verdict({}) != HOLDS:
         raise UserError("the promise is not kept even on a perfect network: lower --promise")
@@ -196,7 +196,7 @@ def find_edges(search: Search) -> dict[str, dict[str, Any]]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Find an envelope; what is known is written after each network, and taken up again."""
+    """Find an envelope; write the progress after each network, and resume an unfinished one."""
     out = arguments.out
     check_writable(out)
     policy = arguments.policy or kept(f"results/policies/{arguments.env}.onnx")
@@ -225,9 +225,9 @@ def run(arguments: argparse.Namespace) -> int:
         search = Search(drive, arguments.promise, arguments.seed, keep)
         begun = read_json(out, "envelope") if Path(out).exists() else {}
         if begun.get("complete") is False and about.items() <= begun.items():
-            with fitting(f"{out} is no envelope that could be gone on with: name another --out"):
+            with fitting(f"{out} is no envelope that can be resumed: name another --out"):
                 search.tried = convert(begun["tried"], dict[str, Tried])
-            print(f"goes on: {len(search.tried)} networks are known from {out}", file=sys.stderr)
+            print(f"resumed: {len(search.tried)} networks are known from {out}", file=sys.stderr)
         try:
             find_edges(search)
             keep(complete=True)
@@ -240,7 +240,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class UntoldError(UserError):
-    """The environment does not say how a drive ended."""
+    """The environment does not report how a drive ended."""
 
 
 class Drivers(ProcessPoolExecutor):
@@ -250,14 +250,14 @@ class Drivers(ProcessPoolExecutor):
         policy = located(policy)
         task = (policy, env, condition, public_key, trained_in(policy, public_key)[1])
         self.policy_id = _load(*task)[2]
-        self._ends = {TRUNCATED}  # How any drive has ended
+        self._ends = {TRUNCATED}  # Outcomes of all drives so far
         super().__init__(jobs or cores(), get_context("spawn"), partial(_begin, *task))
 
     def __exit__(self, *_: object) -> None:
         self.shutdown(cancel_futures=True)
 
     def submit(self, *arguments: Any, **named: Any) -> Any:
-        """Start processes that ^C does not reach, not even while they load: their parent ends."""
+        """Start processes with SIGINT blocked, from their loading on: ^C ends only the parent."""
         before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
         try:
             return super().submit(*arguments, **named)
@@ -267,11 +267,11 @@ class Drivers(ProcessPoolExecutor):
     def drive(self, spec: LatencySpec, seeds: Sequence[int]) -> list[EpisodeResult]:
         """Drive an episode for each seed; return the results without their actions.
 
-        Raises UntoldError where the environment does not report of each drive how it ended.
+        Raises UntoldError if the environment does not report how each drive ended.
         """
         results = list(self.map(partial(_drive, spec), seeds))
         self._ends.update(result.outcome for result in results)
-        # A step limit is a timeout as soon as the end of any other drive was reported.
+        # A step limit is a timeout once any other drive has reported its end.
         if UNKNOWN in self._ends or len(self._ends) == 1:
             raise UntoldError("no outcome or is_success in info tells whether it succeeded")
         return [
@@ -280,7 +280,7 @@ class Drivers(ProcessPoolExecutor):
         ]
 
 
-_mine: list[Any] = []  # Of a process of the pool: environment, driver, condition
+_mine: list[Any] = []  # In a process of the pool: environment, driver, condition
 
 
 def _load(policy: str, env: str, condition: str, key: str | None, period_s: float | None) -> Any:
@@ -302,7 +302,7 @@ def _drive(spec: LatencySpec, seed: int) -> EpisodeResult:
 
 
 def _swept(about: Mapping[str, Any], search: Search) -> dict[str, Any]:
-    """Return the networks that were tried, as a campaign reports them."""
+    """Return the tried networks in the form of a campaign's report."""
     axes, drives = [], [row["drives"] for row in search.tried.values()]
     for name in AXES:
         alone = {row["at"].get(name, 0.0): spec for spec, row in search.tried.items()

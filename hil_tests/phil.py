@@ -10,7 +10,7 @@ from edge_runtime.cli import program, run_cli
 FOLDERS = {
     "trainer": "train a policy with a human's help, evaluate and export it",
     "edge_runtime": "drive a policy on the board",
-    "bridge": "serve the simulator to a board; record, replay and look at the wire",
+    "bridge": "serve the simulator to a board; record, replay and view the wire",
     "hil_tests": "prove the loop without hardware",
     "deploy": "sign, pack and install what the board needs",
 }

@@ -1,4 +1,4 @@
-"""The repository's own commands as processes, and the operator beside a drive."""
+"""Run the repository's own commands as processes, and an operator beside a drive."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ from edge_runtime.util import UserError
 from trainer.util import kept
 
 POLICY = Path(kept("results/policies/left_turn.onnx"))
-PUBLIC_KEY = POLICY.with_name("policy.pub")  # The policy that ships, and what it is verified with
+PUBLIC_KEY = POLICY.with_name("policy.pub")  # The shipped policy, and its signer's key
 PATIENCE_S = 30.0
 OPERATOR_LOOKS_EVERY_S = 0.5
 _LAST_WORDS_S = 1.0
-# Else an edge runtime, which waits for its simulator for ever, outlives a command that is killed.
+# Otherwise an edge runtime, which waits for a simulator for ever, outlives a killed command.
 _ENDS_WITH_US = ["setpriv", "--pdeathsig", "TERM", "--"] if shutil.which("setpriv") else []
 _CRASH_MARKS = ("Traceback (most recent call last)", "panicked at", "Fatal Python error")
 
 
 class CommandTimeoutError(UserError, TimeoutError):
-    """A command or an event did not come in time."""
+    """A command did not end, or an event did not come, in time."""
 
 
 class Process:
-    """``python -m ARGUMENTS`` beside us. It ends with the block, and the thread that started it.
+    """``python -m ARGUMENTS`` beside us. It ends with the block, or the thread that started it.
 
     ``lines`` are its output with monotonic times; ``output`` and ``errors`` the text of each
-    stream. The constructor waits until the text ``ready`` is printed; UserError where it never is.
-    ``shown`` prints the command; ``environment`` holds more variables, ``options`` more of Popen.
+    stream. The constructor waits until the text ``ready`` is printed; UserError if it never is.
+    ``shown`` prints the command; ``environment`` adds variables, ``options`` are Popen's.
     """
 
     def __init__(
@@ -64,10 +64,10 @@ class Process:
             **{**pipes, **options},
         )
         self.pid = self._process.pid
-        self._said: dict[str, list[str]] = {"stdout": [], "stderr": []}
+        self._texts: dict[str, list[str]] = {"stdout": [], "stderr": []}
         self._readers = [
             threading.Thread(target=self._read, args=(stream,), daemon=True)
-            for stream in self._said
+            for stream in self._texts
         ]
         for reader in self._readers:
             reader.start()
@@ -80,11 +80,11 @@ class Process:
 
     @property
     def output(self) -> str:
-        return "".join(self._said["stdout"])
+        return "".join(self._texts["stdout"])
 
     @property
     def errors(self) -> str:
-        return "".join(self._said["stderr"])
+        return "".join(self._texts["stderr"])
 
     @property
     def has_ended(self) -> bool:
@@ -108,7 +108,7 @@ class Process:
         self.wait()
 
     def end(self) -> int:
-        """Send SIGTERM where it still runs; return its exit status."""
+        """Send SIGTERM if it still runs; return its exit status."""
         if not self.has_ended:
             self._process.send_signal(signal.SIGCONT)
             self._process.terminate()
@@ -123,8 +123,8 @@ class Process:
         try:
             status = self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:
-            said = f"python -m {self.name} did not end within {timeout_s:g} s"
-            raise CommandTimeoutError(said) from None
+            text = f"python -m {self.name} did not end within {timeout_s:g} s"
+            raise CommandTimeoutError(text) from None
         for reader in self._readers:
             reader.join(_LAST_WORDS_S)
         return status
@@ -135,9 +135,9 @@ class Process:
             raise self._failure()
 
     def crashed(self) -> bool:
-        """Return whether it ended while nobody waited for that, or printed what a crash prints."""
-        gone = self.has_ended and not self._ended_by_us
-        return gone or any(mark in line for _, line in self.lines for mark in _CRASH_MARKS)
+        """Return whether it ended by itself unawaited, or printed the text of a crash."""
+        vanished = self.has_ended and not self._ended_by_us
+        return vanished or any(mark in line for _, line in self.lines for mark in _CRASH_MARKS)
 
     def __enter__(self) -> Self:
         return self
@@ -149,19 +149,19 @@ class Process:
         return next((seen_s for seen_s, line in self.lines if text in line), None)
 
     def _failure(self) -> UserError:
-        said = (self.errors.strip() or self.output.strip() or "it said nothing").splitlines()
-        return UserError(f"python -m {self.name}: {said[-1]}")
+        lines = (self.errors.strip() or self.output.strip() or "it printed nothing").splitlines()
+        return UserError(f"python -m {self.name}: {lines[-1]}")
 
     def _read(self, stream: str) -> None:
         for line in getattr(self._process, stream) or ():
             seen_s = time.monotonic()
-            self._said[stream].append(line)
+            self._texts[stream].append(line)
             self.lines.append((seen_s, line.rstrip()))
 
 
 @contextlib.contextmanager
 def operator(endpoint: str, vehicle_id: str) -> Iterator[None]:
-    """Re-arm a vehicle after each safe stop, in place of the person of an unattended drive."""
+    """Re-arm a vehicle after each safe stop, in place of an operator."""
     end = threading.Event()
 
     def operate() -> None:
@@ -182,10 +182,10 @@ def operator(endpoint: str, vehicle_id: str) -> Iterator[None]:
 
 
 def run_command(*arguments: object) -> None:
-    """Print ``python -m ...`` and run it to its end; UserError where it failed and has said why."""
+    """Print ``python -m ...`` and run it to its end; UserError if it failed (it has said why)."""
     words = ["python", "-m", *map(str, arguments)]
     print(f"\n$ {shlex.join(words)}", flush=True)
-    # Not `subprocess.call`: after ^C that kills a command which may still save something.
+    # Not `subprocess.call`, which after ^C kills a command that may still save something.
     with subprocess.Popen([sys.executable, *words[1:]]) as process:
         status = process.wait()
     if status:

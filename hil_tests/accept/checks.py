@@ -1,4 +1,4 @@
-"""The table of checks: each asks one thing of policy, link, vehicle or board."""
+"""The table of checks: each tests one property of policy, link, vehicle or board."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ DRIVE, DRIVE_FILE, VEHICLE_ID = "link: round trip in real time", "drive.mcap", "
 DISTURBED_TRIES = 3
 START_S, EPISODE_S, CHECK_S, CONFORMANCE_S = 60.0, 120.0, 300.0, 600.0  # At most
 AXES = {"delay": ("delay_ms", 1000.0, 25.0, "ms"), "loss": ("loss_percent", 50.0, 1.0, "%")}
-"""What gets worse each way: the network's setting, the most that is tried, resolution, unit."""
+"""Network axes, worsened each way: setting, largest value tried, resolution, unit."""
 REALTIME = ("--clock", "realtime", "--latency")
 
 
 class Found(NamedTuple):
-    """What a check measured, and what is wrong, empty where it passed; both in words."""
+    """A check's measurement, and its failure (empty if it passed), in words."""
 
     measured: str
     wrong: str = ""
@@ -52,7 +52,7 @@ class Found(NamedTuple):
 
 
 class Check(NamedTuple):
-    """A line of the table. UserError fails it; an UntoldError says that it cannot be tried."""
+    """A row of the table. A UserError of ``run`` fails it; UntoldError: it cannot be tried."""
 
     name: str
     asked: str
@@ -63,7 +63,7 @@ class Check(NamedTuple):
 
 @dataclass
 class Job:
-    """What is judged. ``policy`` is None where it may not drive, which ``refusal`` tells."""
+    """The policy to judge and how. ``policy`` is None if it may not drive; ``refusal`` says why."""
 
     asked: Namespace
     settings: Any  # The keys of accept.toml
@@ -105,7 +105,7 @@ class Job:
                 record.unlink(missing_ok=True)
                 to = ("--out", record, "--wait-s", START_S, "--connect", endpoint, *us)
                 start(Process("bridge", "record", *to, ready="recording"))
-            # It comes last: now the drive begins.
+            # Last, because its start begins the drive.
             start(Process(*run, *self.trust, *self.edge, "--vehicle", vehicle, ready="ready"))
             if vehicle != NONE:
                 start(operator(endpoint, VEHICLE_ID))
@@ -154,7 +154,7 @@ def trusted(job: Job) -> Found:
 
 
 def inference(job: Job) -> Found:
-    """Ask ``edge_runtime check``, here or on the board by ssh, which is lent the policy."""
+    """Run ``edge_runtime check`` here, or on the board by ssh with a copy of the policy."""
     command = [sys.executable, "-m", "edge_runtime", "check", job.asked.policy, *job.trust]
     if (board := job.asked.board) is not None:
         check = f"{shlex.quote(job.settings.board_command)} check $p --allow-unsigned"
@@ -166,14 +166,14 @@ def inference(job: Job) -> Found:
     except (OSError, subprocess.TimeoutExpired) as error:
         raise UserError(str(error)) from None
     if done.returncode:
-        said = done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
-        raise UserError(said.removeprefix("error: ") or f"it ended with status {done.returncode}")
-    with fitting("check told no inference time"):
-        found = parse_json(done.stdout, "the report of check")["inference_ms"]
-        p50_ms, p99_ms = (float(found[name]) for name in ("p50", "p99"))
+        last = done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
+        raise UserError(last.removeprefix("error: ") or f"it ended with status {done.returncode}")
+    with fitting("check reports no inference time"):
+        times_ms = parse_json(done.stdout, "the report of check")["inference_ms"]
+        p50_ms, p99_ms = (float(times_ms[name]) for name in ("p50", "p99"))
     most_ms = 1e3 * job.settings.inference_share * job.period_s
-    told = f"p50 {p50_ms:.2f}, p99 {p99_ms:.2f} ms on {board or 'this machine'}"
-    return Found(told, "" if p99_ms <= most_ms else f"that is over {most_ms:.0f} ms")
+    measured = f"p50 {p50_ms:.2f}, p99 {p99_ms:.2f} ms on {board or 'this machine'}"
+    return Found(measured, "" if p99_ms <= most_ms else f"that is over {most_ms:.0f} ms")
 
 
 def over_the_wire(job: Job) -> Found:
@@ -181,7 +181,7 @@ def over_the_wire(job: Job) -> Found:
     episodes = evaluate(asked.policy, asked.env, runs=count, public_key=asked.public_key).episodes
     for _ in range(DISTURBED_TRIES):
         report = job.drive(count)
-        if not report["wall_clock_stalls"]:  # Else the machine itself stood still.
+        if not report["wall_clock_stalls"]:  # Otherwise this machine stalled.
             break
     here = [(each.outcome, each.steps) for each in episodes]
     there = [(each["outcome"], each["steps"]) for each in report["per_episode"]]
@@ -199,13 +199,13 @@ def success(condition: str, link: LatencySpec, least: float, job: Job) -> Found:
             raise
         raise UntoldError("the environment has no such scene") from None
     with drivers:
-        found = job.share(drivers, link)
-    wrong = f"the lower end of its interval is below {100 * least:g} %" if found.low < least else ""
-    return Found(f"{found.as_share()} % of {found.size} drives", wrong)
+        share = job.share(drivers, link)
+    wrong = f"the lower end of its interval is below {100 * least:g} %" if share.low < least else ""
+    return Found(f"{share.as_share()} % of {share.size} drives", wrong)
 
 
 def network_at(link: LatencySpec, field: str, value: float) -> LatencySpec:
-    """Return the link with another mean of a setting over both ways."""
+    """Return the link with a setting shifted to another mean over both ways."""
     more, ways = value - mean_of(link, field), (link.up, link.down)
     up, down = (replace(way, **{field: max(0.0, getattr(way, field) + more)}) for way in ways)
     return LatencySpec(up, down, f"{link}, {field} {value:g}")
@@ -216,9 +216,9 @@ def mean_of(link: LatencySpec, field: str) -> float:
 
 
 def distance(axis: str, job: Job) -> Found:
-    """Judge the link with the margin on top; look for the limit unless it is to be quick.
+    """Judge the link with the margin on top; search for the limit, too, unless ``--quick``.
 
-    The limit is the largest value found up to which the success is enough.
+    The limit is the largest value with enough success.
     """
     (field, most, step, unit), link, least = AXES[axis], job.asked.link, job.settings.success_link
     declared, points = mean_of(link, field), dict[float, Estimate]()
@@ -237,8 +237,8 @@ def distance(axis: str, job: Job) -> Found:
     bears = "nothing" if limit is None else f"{'at least ' * job.asked.quick}{limit:g} {unit}"
     wrong = f"the policy bears {bears}, the link has {declared:g} {unit}"
     data = {"points": points, "declared": declared, "limit": limit, "least": least}
-    told = f"{points[worse].as_share()} % at {worse:g} {unit}; bears {bears}"
-    return Found(told, "" if {declared, worse} <= held else wrong, data)
+    measured = f"{points[worse].as_share()} % at {worse:g} {unit}; bears {bears}"
+    return Found(measured, "" if {declared, worse} <= held else wrong, data)
 
 
 def in_real_time(job: Job) -> Found:
@@ -246,7 +246,7 @@ def in_real_time(job: Job) -> Found:
     record = job.path / DRIVE_FILE
     for _ in range(DISTURBED_TRIES):
         report = job.drive(job.settings.drives, *REALTIME, job.asked.link, record=record)
-        if not replay(record, job).wrong:  # Where this machine stands still, stops may differ.
+        if not replay(record, job).wrong:  # If this machine stalls, stops may differ.
             break
     latency, ends = report["latency_ms"], [each["outcome"] for each in report["per_episode"]]
     heard = (message for _, message in valid_messages(Recording(record), VEHICLE_ID))
@@ -255,11 +255,11 @@ def in_real_time(job: Job) -> Found:
     data = {"outcomes": ends, "edge_ms": times_ms, "period_ms": 1e3 * job.period_s}
     if not times_ms or latency["p99"] is None:
         return Found(", ".join(ends), "no state was answered")
-    wrong = f"over {job.settings.round_trip_s:g} s; no rule stops for a delay that stays the same"
-    told = f"p50 {latency['p50']:.1f}, p99 {latency['p99']:.1f} ms; {', '.join(ends)}"
+    wrong = f"over {job.settings.round_trip_s:g} s; no safety rule stops for a constant delay"
+    measured = f"p50 {latency['p50']:.1f}, p99 {latency['p99']:.1f} ms; {', '.join(ends)}"
     is_late = latency["p99"] > 1e3 * job.settings.round_trip_s
-    told += f"; {counted(report['safe_stops'], 'safe stop')}"
-    return Found(told, wrong if is_late else "", data)
+    measured += f"; {counted(report['safe_stops'], 'safe stop')}"
+    return Found(measured, wrong if is_late else "", data)
 
 
 def replay(path: str | Path, job: Job) -> Found:
@@ -269,8 +269,8 @@ def replay(path: str | Path, job: Job) -> Found:
     others = [each[:12] for each in report["recorded_policy_ids"] if each != job.policy_id]
     wrong = [f"policy {', '.join(others)} made it"] if others else []
     wrong += [f"{report['different']} answers differ"] if report["different"] else []
-    told = f"{report['compared'] - report['different']} of {report['compared']} the same"
-    return Found(told, "; ".join(wrong))
+    measured = f"{report['compared'] - report['different']} of {report['compared']} the same"
+    return Found(measured, "; ".join(wrong))
 
 
 def conformance(job: Job) -> Found:
@@ -279,7 +279,7 @@ def conformance(job: Job) -> Found:
     words = ("--vehicle", job.config.vehicle, *job.edge, "--period-s", job.period_s, "--out", out)
     with Process("hil_tests", "conformance", *words) as process:
         process.wait(CONFORMANCE_S)
-        if not out.exists():  # It could not be opened.
+        if not out.exists():  # The driver could not be opened.
             process.succeed()
     rules = read_json(out, "report")["rules"]
     broken = [rule for rule, wrong in rules.items() if wrong]
@@ -306,20 +306,20 @@ def left_out(row: Fault, job: Job) -> str:
 
 
 def fault(row: Fault, job: Job) -> Found:
-    """Do a fault, and once more where it was missed: this machine may have stood still.
+    """Do a fault, and once more if it was missed, because this machine may have stalled.
 
-    A crash and an unsafe command are never the machine's.
+    A crash or an unsafe command is never the machine's fault.
     """
-    told, policy, key = list[str](), Path(job.asked.policy), job.asked.public_key
+    measured, policy, key = list[str](), Path(job.asked.policy), job.asked.public_key
     for _ in range(2):
-        (found,) = run_faults([row], job.settings.tries, policy, public_key=key)["rows"]
-        missed = missed_in(found)
-        if told or not missed or found["unsafe"] or found["crashes"]:
+        (report,) = run_faults([row], job.settings.tries, policy, public_key=key)["rows"]
+        missed = missed_in(report)
+        if measured or not missed or report["unsafe"] or report["crashes"]:
             break
-        told = [f"at first {missed[0]}"]
+        measured = [f"at first {missed[0]}"]
     for kind in ("reaction", "recovery"):
-        if found[f"{kind}_ms"]:
-            limit_ms = found[f"{kind}_limit_ms"]
+        if report[f"{kind}_ms"]:
+            limit_ms = report[f"{kind}_limit_ms"]
             most = f" of {limit_ms:.0f}" if limit_ms is not None else ""
-            told.append(f"{kind} {found[f'{kind}_ms']['max']:.0f}{most} ms")
-    return Found(", ".join(told), "; ".join(missed))
+            measured.append(f"{kind} {report[f'{kind}_ms']['max']:.0f}{most} ms")
+    return Found(", ".join(measured), "; ".join(missed))

@@ -1,7 +1,7 @@
-"""``python -m hil_tests accept``: may this policy drive that vehicle over that network?
+"""``python -m hil_tests accept``: check whether a policy may drive a vehicle over a network.
 
-Each check's row is written to DIR as it comes, so that the same command goes on after ^C or a kill.
-With the report that file goes: the next call begins anew.
+Each check's row is written to a file in DIR at once, so that the same command goes on after ^C or a
+kill. The report replaces that file: the next call begins anew.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from trainer.util import claimed
 
 REJECTED = 1  # Exit status
 UNFINISHED = "unfinished.json"
-SURE_S = 30.0  # After so long, this machine's speed counts as much as the table's times
+SURE_S = 30.0  # After this long, measured times weigh as much as the table's estimates
 _KNOWN = read_toml(Path(__file__).with_name("accept.toml"), "settings")
 _KINDS: dict[type, Any] = {
     int: Annotated[int, msgspec.Meta(ge=1)], float: Annotated[float, msgspec.Meta(ge=0.0, le=1e6)],
@@ -51,7 +51,7 @@ Settings: Any = msgspec.defstruct("Settings", _FIELDS.items(), forbid_unknown_fi
 
 @sigterm_as_interrupt()
 def run(asked: Namespace) -> int:
-    """Do what is not done yet, and write the report; return 0 where nothing failed, else 1."""
+    """Do the remaining checks and write the report; return 0 if nothing failed, else 1."""
     job = prepare(asked)
     with claimed(job.path):
         return judge(job)
@@ -81,11 +81,11 @@ def judge(job: Job) -> int:
 
 def load_settings(path: str | None, quick: bool) -> Any:
     """Read a file over the defaults. UserError for an unknown key or fault, or a wrong value."""
-    given = {**_KNOWN, **(read_toml(path, "settings") if path else {})}
+    table = {**_KNOWN, **(read_toml(path, "settings") if path else {})}
     try:
-        settings = convert(given, Settings)
+        settings = convert(table, Settings)
         if quick:
-            settings = convert({**given, **_KNOWN["quick"], **settings.quick}, Settings)
+            settings = convert({**table, **_KNOWN["quick"], **settings.quick}, Settings)
         choose(",".join(settings.faults), "faults")
         return settings
     except UserError as error:
@@ -93,7 +93,7 @@ def load_settings(path: str | None, quick: bool) -> Any:
 
 
 def prepare(asked: Namespace) -> Job:
-    """Read all that is named. UserError for what is no policy file, environment and so on."""
+    """Read and check all that the options name. Raises UserError."""
     settings, key = load_settings(asked.config, asked.quick), asked.public_key
     check_writable(f"{asked.out}/report.json")
     policy_id = policy_id_of(read_bytes(asked.policy, "policy file", MAX_POLICY_MIB))
@@ -114,7 +114,7 @@ def prepare(asked: Namespace) -> Job:
     else:
         period_s = policy.manifest.control_period_s
         with closing(make_environment(asked.env, period_s=period_s)) as env:
-            load_driver(asked.policy, env, policy.public_key)  # It is for this environment.
+            load_driver(asked.policy, env, policy.public_key)  # Checks that it fits
         vehicle_limits(config.vehicle, config.vehicle_settings, policy.manifest, config.bounds)
     trust = ["--public-key", key] if key else []
     trust += ["--allow-unsigned"] if asked.allow_unsigned else []
@@ -122,33 +122,33 @@ def prepare(asked: Namespace) -> Job:
 
 
 def run_checks(job: Job) -> tuple[list[dict[str, Any]], float]:
-    """Do what is left of the table; return the rows, with `data` for the page, and the seconds."""
-    place, checks = job.path / UNFINISHED, table(job)
+    """Do the remaining checks; return all rows, with `data` for the page, and the seconds."""
+    path, checks = job.path / UNFINISHED, table(job)
     what = {name: str(value) for name, value in vars(job.asked).items()}
     what |= {"policy_id": job.policy_id, "settings": str((job.settings, job.config, job.refusal))}
     what["checks"] = str([check.name for check in checks])
-    known: dict[str, Any] = {}
+    progress: dict[str, Any] = {}
     with suppress(UserError):
-        known = read_json(place, "what is done")
-    if known.get("what") != what:
-        known = {"what": what, "rows": [], "seconds": 0.0}
+        progress = read_json(path, "progress file")
+    if progress.get("what") != what:
+        progress = {"what": what, "rows": [], "seconds": 0.0}
         for name in ("report.json", "junit.xml", "report.html"):
             (job.path / name).unlink(missing_ok=True)
-    rows, took_s, table_s = known["rows"], SURE_S, SURE_S
+    rows, took_s, table_s = progress["rows"], SURE_S, SURE_S
     while left := checks[len(rows) :]:
         check, begun_s = left[0], time.monotonic()
         rows.append(row := attempt(check, job))
         if row["result"] == FAILED and check.name in GATES:
-            why = f"it fails in: {check.name}"
+            why = f"the policy fails in: {check.name}"
             rows += [attempt(each._replace(skipped=why), job) for each in left[1:]]
-        known["seconds"] += (seconds := time.monotonic() - begun_s)
-        write_json(place, known)
+        progress["seconds"] += (seconds := time.monotonic() - begun_s)
+        write_json(path, progress)
         if row["result"] != NOT_TRIED:
             took_s, table_s = took_s + seconds, table_s + check.takes_s
             rest_s = sum(each.takes_s for each in checks[len(rows) :] if not each.skipped)
-            told = f"{row['result']:<6}  {check.name}: {row['measured']}"
-            print(f"{rest_s * took_s / table_s / 60.0:4.1f} min left  {told}", flush=True)
-    return rows, known["seconds"]
+            line = f"{row['result']:<6}  {check.name}: {row['measured']}"
+            print(f"{rest_s * took_s / table_s / 60.0:4.1f} min left  {line}", flush=True)
+    return rows, progress["seconds"]
 
 
 def attempt(check: Check, job: Job) -> dict[str, Any]:
@@ -163,5 +163,5 @@ def attempt(check: Check, job: Job) -> dict[str, Any]:
             result, why = FAILED, str(error)
     row = {"name": check.name, "asked": check.asked, "measured": found.measured}
     texts = {**row, "result": result, "why": why}
-    # A name or another program's words may hold what no XML can.
+    # A name or another program's text may hold characters that XML forbids.
     return {**{key: printable(text) for key, text in texts.items()}, "data": found.data}

@@ -30,8 +30,8 @@ GOOD, BAD, PLAIN = "#2b7a4b", "#b3322e", "#2868b8"
 def junit(report: Mapping[str, Any]) -> bytes:
     results = [check["result"] for check in report["checks"]]
     counts = {"failures": results.count(FAILED), "skipped": results.count(NOT_TRIED)}
-    told = {"name": "accept", "tests": len(results), **counts, "time": report["seconds"]}
-    suite = Element("testsuite", {key: str(value) for key, value in told.items()})
+    figures = {"name": "accept", "tests": len(results), **counts, "time": report["seconds"]}
+    suite = Element("testsuite", {key: str(value) for key, value in figures.items()})
     for check in report["checks"]:
         case = SubElement(suite, "testcase", classname="accept", name=check["name"])
         end = SubElement(case, JUNIT[check["result"]])
@@ -97,7 +97,7 @@ def svg(figure: Figure) -> str:
 
 
 def strips(path: Path, outcomes: list[str]) -> Iterator[tuple[str, list[tuple[str, str]]]]:
-    """Yield some recorded drives, the failed first: title, and frames as times and addresses."""
+    """Yield some recorded drives, failed ones first: title, and frames as (time, data URL)."""
     films: dict[int, list[Scene]] = {}
     recording = Recording(path)
     for _, message in valid_messages(recording, choose_vehicle(recording, None)):
@@ -111,7 +111,7 @@ def strips(path: Path, outcomes: list[str]) -> Iterator[tuple[str, list[tuple[st
 
 
 def picture_of(scene: Scene) -> str:
-    """Return the scene around the car, or the picture in its place, as an image's address."""
+    """Return the scene around the car, or else the picture, as an image's data URL."""
     if scene.picture:
         picture: Image.Image = Image.open(io.BytesIO(scene.picture))
     else:

@@ -1,6 +1,6 @@
-"""What may not happen whatever is asked: faster than the cap, beyond the leash, an unasked episode.
+"""Faults against the operator's bounds: speed cap, leash, and the re-arm of each episode.
 
-A mock Hunter is driven; 0x221 on its bus is believed, for the mock does not lie here.
+A mock Hunter is driven; its 0x221 is taken as the truth, because this mock does not lie.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _HUNTER = MODELS["hunter-2.0"]
 
 
 def at_the_cap(rig: Rig) -> Try:
-    """Judge that it drives as fast as it may, and no faster: at first from where it has braked."""
+    """Judge that it drives as fast as its cap, and no faster, after it has braked."""
     rig.switch(BRIGHT, None)
     time.sleep(LASTS_S)
     rig.switch(BRIGHT, "")
@@ -38,12 +38,12 @@ def at_the_cap(rig: Rig) -> Try:
 
 
 def leash(rig: Rig) -> Try:
-    """Judge how far it goes on one re-arm, and that neither time nor a restart adds to it."""
+    """Judge the distance of one re-arm, and that neither time nor a restart adds to it."""
     rig.stop_command(time.monotonic())
     rig.chassis.stands_s(time.monotonic(), STANDS_WITHIN_S)
     rig.rearm()
     rig.wait_until_driving(lambda: rig.chassis.moves)
-    begun_s = rig.chassis.truth[-1][0] - FAST_S  # it was re-armed where it stood
+    begun_s = rig.chassis.truth[-1][0] - FAST_S  # it was re-armed at a stand
     stop = rig.stop_command(time.monotonic())
     stands_s = rig.chassis.stands_s(stop.seen_s, STANDS_WITHIN_S)
     heard = [(s, abs(speed_mps(data))) for s, data in rig.monitor.of(SPEED, begun_s)]
@@ -52,7 +52,7 @@ def leash(rig: Rig) -> Try:
     fastest_mps = max(mps for _, mps in heard)
     stopping_m = fastest_mps * (_HUNTER.dead_time_s + FAST_S)
     stopping_m += fastest_mps**2 / (2 * _HUNTER.braking_mps2)
-    # A busy machine may stop it before, for another reason.
+    # On a busy machine it may stop before, for another reason.
     least_m = 0.8 * LEASH_M * (stop.reason == Event.LEASH.value)
     wrong = [f"{gone_m:.2f} m"] * (not least_m <= gone_m < LEASH_M + stopping_m)
     time.sleep(QUIET_S)
@@ -67,9 +67,9 @@ def leash(rig: Rig) -> Try:
 
 
 def new_episode(rig: Rig) -> Try:
-    """Judge that no new episode starts it, behind a final state or not, of a new number or not."""
+    """Judge that no new episode starts it, with or without a final state or a new number."""
     sender, kind = rig.sender, rig.number % 3
-    rig.wait_until_driving(lambda: rig.chassis.moves)  # else it may stand now, and move a moment on
+    rig.wait_until_driving(lambda: rig.chassis.moves)  # otherwise it might begin to move below
     sender.running.clear()
     if kind != 2:
         sender.send_next(final=True)
@@ -83,8 +83,8 @@ def new_episode(rig: Rig) -> Try:
     time.sleep(LASTS_S)
     wrong += rig.timeline.drives_between(begin_s)
     wrong += ["moved without a re-arm"] * rig.chassis.moved_between(stands_s, time.monotonic())
-    told = {c.reason for c in rig.timeline.commands if c.seen_s > begin_s}
-    wrong += [f"stopped for {told}"] * (Event.EPISODE.value not in told)
+    reasons = {c.reason for c in rig.timeline.commands if c.seen_s > begin_s}
+    wrong += [f"stopped for {reasons}"] * (Event.EPISODE.value not in reasons)
     return Try(None, rig.drive_again(lambda: rig.chassis.moves), stop.reason, wrong)
 
 

@@ -1,10 +1,10 @@
 """Faults of a Hunter on a CAN bus: the edge runtime's driver against the mock as a process.
 
-The rule, for each row: within 2 T + 50 ms after the edge can know, the set-point on the bus is
-speed 0 and stays so; the vehicle stands by the mock's own truth; feedback names the fault; only a
-re-arm lets it move, though the mock drives on by itself. When the edge can know:
-- silent, bus off, late: at the last frame that came in time, for the next ones were due;
-- frozen: the same, and STATUS_SILENCE_S later, for it goes on sending;
+The rule, for each row: within 2 T + 50 ms after the edge can know of the fault, the set-point on
+the bus is speed 0 and stays so; the vehicle stands by the mock's own state; feedback names the
+fault; only a re-arm lets it move, though the mock would drive on by itself. The edge can know:
+- silent, bus off, late: at the last frame that came in time, because the next ones were due;
+- frozen: the same, and STATUS_SILENCE_S later, because frames still come;
 - the others: at the first frame on the bus that shows it (full lock: and DEVIATES_S later);
 - stuck: at the first set-point that the vehicle should follow and does not (it may lag FOLLOWS_S).
 """
@@ -26,9 +26,9 @@ from hil_tests.faults.rows import Row, Try, at_any_phase
 from hil_tests.mock_hunter import BITS, FAULTS, MODELS
 
 QUIET_S = 0.5
-"""So long it must stand when the fault is over: the mock takes set-points up again within 20 ms."""
+"""It must stand for this long after the fault: the mock obeys set-points again within 20 ms."""
 STANDS_WITHIN_S = 2.0
-"""After the fault: our reaction, the chassis's own 0.5 s where it hears nothing, the braking."""
+"""After the fault: our reaction, the chassis's own time-out of 0.5 s, and the braking."""
 _MOST_MPS = MODELS["hunter-2.0"].max_speed_mps
 _FAST_MPS = 0.97 * _MOST_MPS
 _DIFFERS_MPS = 0.15
@@ -37,11 +37,11 @@ _LATER_S = {
     "frozen": STATUS_SILENCE_S, "full_lock": DEVIATES_S, "stuck": FOLLOWS_S + DEVIATES_S,
 }  # fmt: skip
 _REFUSED = ("silent", "frozen", "bus_off", "remote", "estop")
-"""While these last, the runtime refuses to be re-armed: it would be in vain."""
+"""While these last, the runtime refuses a re-arm."""
 
 
 class Expect(NamedTuple):
-    """A fault of the mock, its words in the feedback, and what frame shows it (0: none does)."""
+    """A fault of the mock, its words in the feedback, and the frame that shows it (0: none)."""
 
     name: str
     says: str
@@ -54,18 +54,18 @@ def speed_mps(data: bytes) -> float:
 
 
 def at_fault(expect: Expect, rig: Rig) -> Try:
-    """Judge that it stops for the fault, stands when it is over, and drives once re-armed."""
+    """Judge that it stops for the fault, still stands after it, and drives once re-armed."""
     chassis, monitor = rig.chassis, rig.monitor
     rig.switch(BRIGHT, "")
     rig.wait_until_driving(lambda: any(speed_mps(d) > _FAST_MPS for _, d in monitor.of(SPEED)[-3:]))
     at_any_phase(rig)
     on_s = chassis.switch(expect.name, True)
-    if expect.name == "stuck":  # Nobody can know before it is asked for another speed.
+    if expect.name == "stuck":  # Nobody can know before another speed is asked for.
         rig.switch(BRIGHT, None)
     stop = rig.stop_command(on_s)
     stands_s = chassis.stands_s(on_s, STANDS_WITHIN_S)
-    taken = expect.name in _REFUSED and rig.try_rearm()
-    wrong = ["was re-armed while the fault lasted"] if taken else []
+    rearmed = expect.name in _REFUSED and rig.try_rearm()
+    wrong = ["was re-armed while the fault lasted"] if rearmed else []
     if expect.can_id:
         shown = (s for s, data in monitor.of(expect.can_id, on_s) if expect.shows(data))
     else:
@@ -81,23 +81,23 @@ def at_fault(expect: Expect, rig: Rig) -> Try:
     wrong += rig.timeline.drives_between(stop.seen_s, quiet_s)
     wrong += [f"stopped for {stop.reason}"] * (stop.reason != Event.VEHICLE.value)
     wrong += ["moved before it was re-armed"] * chassis.moved_between(stands_s, quiet_s)
-    told_s = _told_s(monitor, on_s, quiet_s)
+    zero_s = _zero_s(monitor, on_s, quiet_s)
     recovered_s = rig.drive_again(ready=lambda: chassis.moves)
-    return Try(told_s - known_s, recovered_s, stop.reason, wrong)
+    return Try(zero_s - known_s, recovered_s, stop.reason, wrong)
 
 
-def _told_s(monitor: CanMonitor, on_s: float, until_s: float) -> float:
-    """Return since when every set-point has been speed 0; ``until_s`` where it never was."""
-    told_s = until_s
+def _zero_s(monitor: CanMonitor, on_s: float, until_s: float) -> float:
+    """Return since when every set-point has been speed 0; ``until_s`` if none has."""
+    zero_s = until_s
     for seen_s, data in reversed(monitor.of(SET_POINT, on_s)):
         if speed_mps(data) != 0.0:
             break
-        told_s = min(told_s, seen_s)
-    return told_s
+        zero_s = min(zero_s, seen_s)
+    return zero_s
 
 
 def strange_frames(monitor: CanMonitor) -> list[str]:
-    """Return lines where a frame or a set-point was on the bus that should never be."""
+    """Return a line for a frame, and for a set-point, that should never be on the bus."""
     wrong = [f"0x{can_id:x} was on the bus" for can_id in monitor.strange[:1]]
     asked = (speed_mps(data) for _, data in monitor.of(SET_POINT))
     return wrong + [f"asked for {each:.2f} m/s" for each in asked if abs(each) > _MOST_MPS][:1]
@@ -106,11 +106,11 @@ def strange_frames(monitor: CanMonitor) -> list[str]:
 def _named(rig: Rig, expect: Expect, since_s: float) -> list[str]:
     if not any(health.vehicle_fault for health in rig.timeline.health[-2:]):
         return ["health names no fault of the vehicle"]
-    told = (feedback for seen_s, feedback in rig.timeline.feedback if seen_s > since_s)
-    said = {text for feedback in told for text in feedback.faults}
-    if any(one in text for one in expect.says.split("|") for text in said):
+    reports = (feedback for seen_s, feedback in rig.timeline.feedback if seen_s > since_s)
+    faults = {text for feedback in reports for text in feedback.faults}
+    if any(words in text for words in expect.says.split("|") for text in faults):
         return []
-    return [f"feedback says {sorted(said)}, not {expect.says!r}"]
+    return [f"feedback says {sorted(faults)}, not {expect.says!r}"]
 
 
 _EXPECTS = (

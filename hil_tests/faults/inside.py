@@ -1,7 +1,7 @@
-"""What runs inside the disturbed processes: a drive without an end, and commands with faults.
+"""Code inside the disturbed processes: an endless drive, and commands with faults.
 
 ``python -m hil_tests.faults.inside PACKAGE ARGUMENTS`` is the real command, with faults that cannot
-be done to it from outside. The directory PHIL_FAULT_DIR holds TASK, and switches, which are files:
+be injected from outside. The directory PHIL_FAULT_DIR holds TASK, and switches, which are files:
 END ends the episode, BRIGHT turns pictures white, SLOW slows inference down, VEHICLE and SOURCE
 hold the fault of the mock vehicle and of a source of `sense`. BRAKES is the log of the simulated
 brake: a line for each change, with its monotonic time and 1 where it is pressed.
@@ -45,18 +45,18 @@ Observation = dict[str, np.ndarray]
 
 
 class EndlessEnv(gymnasium.Env[Observation, np.ndarray]):
-    """A car on a straight road, whose pedal is the first action; it sees noise."""
+    """A car on a straight road; its pedal is the first action, its observation noise."""
 
     def __init__(self) -> None:
         self._task = task = msgspec.json.decode((HERE / TASK).read_bytes(), type=Task)
         self.scenario, self.control_period_s = task.task, task.control_period_s
-        self.action_names = tuple(one.name for one in task.action)
+        self.action_names = tuple(row.name for row in task.action)
         boxes: dict[str, spaces.Space[Any]] = {}
         for name, entry in task.observation.items():
             low, high = _RANGES.get(entry.dtype, (-9, 9))
             boxes[name] = spaces.Box(low, high, tuple(entry.shape), np.dtype(entry.dtype).type)
         self.observation_space: Any = spaces.Dict(boxes)
-        ends = ((one.low, one.high, one.stop or 0.0) for one in task.action)
+        ends = ((row.low, row.high, row.stop or 0.0) for row in task.action)
         low, high, self.brake_action = np.array(list(ends), np.float32).T
         self.action_space = spaces.Box(low, high)
         self._braking = False
@@ -66,7 +66,7 @@ class EndlessEnv(gymnasium.Env[Observation, np.ndarray]):
     ) -> tuple[Observation, dict[str, Any]]:
         super().reset(seed=seed)
         self._speed_mps = self._distance_m = 0.0
-        return self._seen()
+        return self._observe()
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         first = self._task.action[0]
@@ -74,7 +74,7 @@ class EndlessEnv(gymnasium.Env[Observation, np.ndarray]):
         speed_mps = self._speed_mps + pedal * _FULL_MPS2 * self.control_period_s
         self._speed_mps = min(max(speed_mps, 0.0), _MOST_MPS)
         self._distance_m += self._speed_mps * self.control_period_s
-        observation, info = self._seen()
+        observation, info = self._observe()
         return observation, 0.0, (HERE / END).exists(), False, info
 
     def press_brake(self, pressed: bool) -> None:
@@ -83,21 +83,21 @@ class EndlessEnv(gymnasium.Env[Observation, np.ndarray]):
             with (HERE / BRAKES).open("a") as brakes:
                 brakes.write(f"{time.monotonic():.6f} {int(pressed)}\n")
 
-    def _seen(self) -> tuple[Observation, dict[str, Any]]:
+    def _observe(self) -> tuple[Observation, dict[str, Any]]:
         info = {"distance_m": self._distance_m, "speed_mps": self._speed_mps, "outcome": "goal"}
         return noise(self._task, self.np_random, (HERE / BRIGHT).exists()), info
 
 
 def noise(task: Task, generator: np.random.Generator, bright: bool = False) -> Observation:
-    """Draw an observation; pictures are below half brightness, or white."""
-    drawn = {}
+    """Draw a random observation; pictures are below half brightness, or white."""
+    observation = {}
     for name, entry in task.observation.items():
         is_picture = entry.dtype == "uint8"
         values = generator.integers(0, 120 if is_picture else 2, entry.shape)
         if is_picture and bright:
             values = np.full(entry.shape, 255)
-        drawn[name] = (values - 0.5 * (entry.dtype == "float32")).astype(entry.dtype)
-    return drawn
+        observation[name] = (values - 0.5 * (entry.dtype == "float32")).astype(entry.dtype)
+    return observation
 
 
 if "PhilEndless-v0" not in gymnasium.registry:
@@ -168,9 +168,9 @@ def launch(package: str, *arguments: str) -> None:
     for number, to_s in ((signal.SIGUSR1, _STEP_S), (signal.SIGUSR2, 0)):
         signal.signal(number, lambda *_, to_s=to_s: step_s.__setitem__(0, to_s))
 
-    def act_slowly(*seen: Any) -> np.ndarray:
+    def act_slowly(*arguments: Any) -> np.ndarray:
         time.sleep(SLOWER_S * (HERE / SLOW).exists())
-        return act(*seen)
+        return act(*arguments)
 
     Policy.act = act_slowly  # type: ignore[method-assign, assignment]
     sys.argv = [package, *arguments]

@@ -1,4 +1,4 @@
-"""Faults of messages: bad, foreign, too many, too large, and bytes that are no messages at all."""
+"""Faults of messages: invalid, foreign, too many, too large, and random bytes."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from hil_tests.processes import wait_until
 
 FLOOD_PER_S, FLOOD_S = 10_000, 2.0
 COUNT, PER_S = 10_000, 2_500
-"""Of garbage, and its pace: enough to hurt, little enough that the drive goes on beside it."""
+"""Number of garbage messages and their rate: a load beside which the drive can still go on."""
 _FOREIGN = "garbage"
-"""Session of the messages that mutations start from: what is valid still is rejected by it."""
+"""Session of the messages before their mutation: a mutant that is valid is rejected by it."""
 _HOUR_NS = 3600 * 1_000_000_000
 
 
@@ -34,7 +34,7 @@ def bad_states(rig: Rig) -> Try:
             for reason, payload in _bad_of(rig.sender.step, rig.task):
                 rig.probe.put("state", payload)
                 sent[reason] += 1
-            # From now on they say that they are from the future, which is no reason to stop.
+            # From now on the states' stamps are in the future, which is no reason to stop.
             rig.sender.ahead_ns += _HOUR_NS * (turn == 25)
             rig.sender.step += 2  # Two states have overtaken one another.
             rig.sender.send(rig.sender.state(rig.sender.step))
@@ -81,7 +81,7 @@ def flood(rig: Rig) -> Try:
 def second_simulator(rig: Rig) -> Try:
     steps = round(2.0 / rig.period_s)
     for step in range(steps):
-        # Where the first one is silent for 2 T it may be answered: it is no garbage.
+        # Noted, because it may be answered if the first simulator is silent for 2 T.
         rig.timeline.states[("second", rig.number, step)] = time.monotonic()
         state = noisy_state(step, rig.task, session="second", episode=rig.number)
         rig.probe.put("state", encode(state))
@@ -92,8 +92,8 @@ def second_simulator(rig: Rig) -> Try:
 def second_edge(rig: Rig) -> Try:
     second = rig.start_edge()
     status = second.wait()
-    time.sleep(rig.period_s)  # Until the probe has heard the last of it, and the first one's.
-    # By drives alone: its last safe stop is obeyed beside the other's drive, which is safe.
+    time.sleep(rig.period_s)  # Until the probe has received the last commands of both.
+    # Drives only: the simulator also takes the second one's last safe stop, which is safe.
     answers = Counter(c.place for c in rig.timeline.commands if c.mode == DRIVE)
     stale = {"stale": sum(count - 1 for count in answers.values())}
     ended = f"the second one ended with status {status}: {second.lines[-1:]}"
@@ -144,7 +144,7 @@ def garbage_health(rig: Rig) -> Try:
 
 
 def _put_garbage(rig: Rig, topic: str, valid: Message) -> Try:
-    """Send COUNT mutations of a message; what is valid still belongs to a foreign session."""
+    """Send COUNT mutations of a message; those still valid belong to a foreign session."""
     decode = DECODERS[topic]
     legal = "foreign_session" if topic in ("state", "command") else ""
     if topic == "state":
@@ -162,7 +162,7 @@ def _put_garbage(rig: Rig, topic: str, valid: Message) -> Try:
 
 
 def mutated(valid: bytes, count: int, seed: int) -> Iterator[bytes]:
-    """Yield ``count`` mutations, the same for the same seed. Some may be valid still."""
+    """Yield ``count`` mutations of a message from a seed. Some may still be valid."""
     generator = np.random.default_rng(seed)
     names = sorted(msgspec.msgpack.decode(valid))
     for _ in range(count):
@@ -196,7 +196,7 @@ _ABSURD: tuple[object, ...] = (
 )  # fmt: skip
 _COUNTED: dict[str, Any] = {"expected": "drives on; each rejected and counted by reason"}
 _BY_EDGE, _BY_SIMULATOR = ({**_COUNTED, "counted": end} for end in ("edge", "simulator"))
-_ENDS: dict[str, Any] = {"flows": False}  # The simulator counts only when the drive has ended.
+_ENDS: dict[str, Any] = {"flows": False}  # The simulator reports its counts when the drive ends
 ROWS = [
     drives_on("bad_states", "Truncated, wrong schema, NaN, old, repeated, reordered, future states",
               bad_states, **_BY_EDGE, rig={"sender": True}),

@@ -1,6 +1,6 @@
-"""What stands between the two ends of a drive, and what is seen there: Zenoh, TCP and CAN.
+"""Probes between the two ends of a drive (Zenoh, TCP, CAN), and their observations.
 
-Times are monotonic seconds, which are one clock for all processes of a machine.
+Times are monotonic seconds: one clock for all processes of a machine.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from edge_runtime.wire import DRIVE, SAFE_STOP
 from hil_tests.faults.policies import TASK
 
 REACTION_LIMIT_S = 2 * TASK.control_period_s + 0.05
-"""After the last good state a safe stop is out, or the other end brakes by itself."""
+"""From the last good state to a safe stop on the wire, or to the other end's own brake."""
 RECOVERY_LIMIT_S = 1.0
 """From the end of the fault to the first drive command, with no vehicle attached."""
 SET_POINT, STATUS, SPEED = HEARD = (0x111, 0x211, 0x221)
 _LOOPBACK = "127.0.0.1"
-_CHUNK_BYTES = 4096  # Small, so that a throttled relay hands over bit by bit
+_CHUNK_BYTES = 4096  # Small, so that a throttled relay passes data on smoothly
 
 Place = tuple[str, int, int]  # Session, episode and step of a state
 
@@ -54,13 +54,13 @@ class CommandSeen(NamedTuple):
 class DriveTimeline:
     """Events in order of arrival. Threads only append."""
 
-    states: dict[Place, float] = field(default_factory=dict)  # Each that a policy may answer
+    states: dict[Place, float] = field(default_factory=dict)  # Those that a policy may answer
     flow_s: list[float] = field(default_factory=list)
-    """When the states of the drive itself came: gaps in it are the machine's, or the fault's."""
+    """Arrivals of the drive's own states: a gap is a stall of the machine, or the fault's."""
     commands: list[CommandSeen] = field(default_factory=list)
     feedback: list[tuple[float, wire.Feedback]] = field(default_factory=list)
     health: list[wire.Health] = field(default_factory=list)
-    unreadable: int = 0  # Commands that no receiver would take
+    unreadable: int = 0  # Commands that no receiver can decode
 
     def note_state(self, state: wire.State, seen_s: float) -> None:
         self.states.setdefault((state.session, state.episode, state.step), seen_s)
@@ -70,17 +70,17 @@ class DriveTimeline:
         return longest_gap_s([c.seen_s for c in self.commands], begin_s, end_s)
 
     def stops_between(self, begin_s: float, end_s: float) -> list[str]:
-        """Return a line for each reason of the safe stops in between, where it was to drive on."""
+        """Return a line for each reason of safe stops in between, where the drive should go on."""
         seen = (c for c in self.commands if begin_s < c.seen_s < end_s and c.mode == SAFE_STOP)
         return [f"safe stop: {reason}" for reason in dict.fromkeys(c.reason for c in seen)]
 
     def drives_between(self, begin_s: float, end_s: float = math.inf) -> list[str]:
-        """Return a line where it drove in between, before it was re-armed."""
+        """Return a line if a drive command was sent in between, before a re-arm."""
         drove = any(begin_s < c.seen_s < end_s and c.mode == DRIVE for c in self.commands)
         return ["was told to drive before it was re-armed"] if drove else []
 
     def unsafe_commands(self, task: Task = TASK) -> list[str]:
-        """Return what is wrong with each unsafe command.
+        """Return a line for each unsafe command.
 
         A ``drive`` is unsafe outside the task's ranges, in answer to no acceptable state, and later
         than the reaction limit after its state.
@@ -92,19 +92,19 @@ class DriveTimeline:
                 continue
             state_s = self.states.get(command.place)
             ranges = zip(command.action, task.action, strict=False)
-            inside = all(one.low <= value <= one.high for value, one in ranges)
+            inside = all(row.low <= value <= row.high for value, row in ranges)
             if len(command.action) != len(task.action) or not inside:
                 found.append(f"{command.place}: action {command.action}")
             elif state_s is None:
                 found.append(f"{command.place}: answers no acceptable state")
-            # The edge's clock may have been stepped ahead: nothing is sent after it is seen.
+            # The edge's clock may have been stepped ahead, so `seen_s` bounds the sending, too.
             elif (age_s := min(command.sent_s, command.seen_s) - state_s) > limit_s:
                 found.append(f"{command.place}: its state was {age_s:.3f} s old")
         return found
 
 
 def later_s(task: Task) -> float:
-    """Return by how much 2 T of this task exceed those of T = 0.1 s, s."""
+    """Return by how many seconds 2 T of this task exceed 0.2 s."""
     return 2.0 * (task.control_period_s - TASK.control_period_s)
 
 
@@ -114,9 +114,9 @@ def longest_gap_s(times_s: Iterable[float], begin_s: float, end_s: float) -> flo
 
 
 class Probe:
-    """A Zenoh router between the two ends that stamps what passes, until the ``stack`` ends.
+    """A Zenoh router between the two ends that notes all messages, until the ``stack`` ends.
 
-    It listens for the edge runtime and connects to the simulator, so that it hears each alone, too.
+    It listens for the edge runtime and connects to the simulator: it works with either one alone.
     """
 
     def __init__(
@@ -132,12 +132,12 @@ class Probe:
         self._session = stack.enter_context(opened)
         for topic in ("state", "command", "health", "feedback"):
             key, hear = wire.key(vehicle_id, topic), partial(self._hear, topic)
-            # It hears the others, not itself.
+            # Not its own messages.
             hears: Any = {"handler": hear, "allowed_origin": zenoh.Locality.REMOTE}
             stack.enter_context(self._session.declare_subscriber(key, **hears))
 
     def put(self, topic: str, payload: bytes) -> None:
-        # BLOCK: a message that the campaign says it sent has been sent.
+        # BLOCK, so that no message that the campaign counts as sent is dropped.
         block = zenoh.CongestionControl.BLOCK
         self._session.put(wire.key(self._vehicle_id, topic), payload, congestion_control=block)
 
@@ -147,11 +147,11 @@ class Probe:
         match DECODERS[topic](bytes(sample.payload)):
             case wire.State() as state:
                 timeline.note_state(state, seen_s)
-            case wire.Command() as told:
-                place = (told.session, told.episode, told.step)
-                sent_s = (told.sent_ns - offset_ns) * 1e-9
-                seen = CommandSeen(seen_s, sent_s, place, told.mode, told.action, told.reason)
-                timeline.commands.append(seen)
+            case wire.Command() as command:
+                place = (command.session, command.episode, command.step)
+                stamps = seen_s, (command.sent_ns - offset_ns) * 1e-9
+                answer = command.mode, command.action, command.reason
+                timeline.commands.append(CommandSeen(*stamps, place, *answer))
             case wire.Feedback() as feedback:
                 timeline.feedback.append((seen_s, feedback))
             case wire.Health() as health:
@@ -161,7 +161,7 @@ class Probe:
 
 
 class Relay:
-    """Passes TCP on from ``endpoint`` to ``target``, an endpoint of this machine."""
+    """Relays TCP from ``endpoint`` to ``target``, an endpoint of this machine."""
 
     def __init__(self, target: str) -> None:
         self._target = (_LOOPBACK, int(target.rpartition(":")[2]))
@@ -176,22 +176,22 @@ class Relay:
         threading.Thread(target=self._accept, daemon=True).start()
 
     def cut(self) -> None:
-        """Break every connection and refuse new ones; what was under way is lost."""
+        """Break every connection and refuse new ones; data under way is lost."""
         with self._lock:
             self._is_cut = True
             while self._open:
                 _shut(self._open.pop())
 
     def stall(self) -> None:
-        """Keep the connections and hold what comes, as a radio link that repeats does."""
+        """Keep the connections and hold the data, as a radio link does while it retransmits."""
         self._flowing.clear()
 
     def throttle(self, bytes_per_s: float) -> None:
-        """Hand no more to whoever connected; what is not handed over yet waits."""
+        """Limit the rate towards the side that connected; the rest of the data waits."""
         self._bytes_per_s = bytes_per_s
 
     def restore(self) -> None:
-        """Pass all on again; what was held comes at once."""
+        """Pass all data on again; held data comes at once."""
         self._is_cut, self._bytes_per_s = False, math.inf
         self._flowing.set()
 
@@ -247,11 +247,11 @@ class CanMonitor(can.Listener):
 
     def on_message_received(self, msg: can.Message) -> None:
         if msg.arbitration_id in HEARD:
-            # By the kernel, on the wall clock: how late this thread runs does not count.
+            # The kernel's wall-clock stamp, so that this thread's own delay does not count.
             seen_s = msg.timestamp + time.monotonic() - time.time()
             self.heard.append((seen_s, msg.arbitration_id, bytes(msg.data)))
         if msg.arbitration_id not in FRAMES or msg.is_extended_id:
             self.strange.append(msg.arbitration_id)
 
     def on_error(self, exc: Exception) -> None:
-        """Ignore what a socket cannot unpack: it is no frame."""
+        """Ignore data that is no frame."""

@@ -1,4 +1,4 @@
-"""What the rows of faults drive: a task, and policies for it of a line each."""
+"""The task of the fault rows, and one-line policies for it."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""A drive to be disturbed, of real processes.
+"""A drive of real processes, to be disturbed.
 
     [mock Hunter --] edge runtime --- [relay | router ---] probe --- simulator
 
-In place of the simulator the rig may send states itself, where a row sends states of its own.
+For a row with states of its own, the rig sends states in place of the simulator.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ _HEALTH_S = 0.6  # Longer than a period of the health message
 
 
 class Rig:
-    """Start it with ``with``; it ends every process that it started.
+    """Use it in a ``with`` block, which ends every process that it started.
 
-    ``policy`` are the edge runtime's options for its policy, made for ``task``; ``vehicle`` is its
-    ``--vehicle`` (``hunter``: with a mock on a CAN bus), ``settings`` its TOML. Switches and
-    reports lie in the empty ``directory``. Edge runtime and probe meet at a ``relay`` or
-    ``router``, if it is ``between``. ``sender``: states are sent here, without a simulator;
-    ``senses``: by a source. The attributes below exist only where the options ask for them.
+    ``policy`` holds the edge runtime's options for its policy, made for ``task``; ``vehicle`` is
+    its ``--vehicle`` (``hunter``: with a mock on a CAN bus), ``settings`` its TOML. Switches and
+    reports lie in ``directory``, which is empty at first. ``between`` edge runtime and probe may be
+    a ``relay`` or a ``router``. In place of a simulator ``sender`` sends states here, ``senses`` by
+    a source of `sense`. The attributes below exist only if the options ask for them.
     """
 
     simulator: Process
@@ -68,7 +68,7 @@ class Rig:
         senses: bool = False,
         settings: str = "",
     ) -> None:
-        self.number = 0  # Of the try
+        self.number = 0  # The number of the try
         self.timeline = DriveTimeline()
         self.crashes: list[str] = []
         self.task, self.period_s = task, task.control_period_s
@@ -82,7 +82,7 @@ class Rig:
         (directory / inside.TASK).write_bytes(msgspec.json.encode(task))
         self._listen, self._hub = free_endpoint(), free_endpoint()
         self.edge_endpoint = self._hub
-        with contextlib.ExitStack() as self._closing:  # a rig that cannot start leaves nothing
+        with contextlib.ExitStack() as self._closing:  # a rig that fails to start leaves nothing
             if not sender:
                 self.simulator = self.start_simulator()
             connect = None if sender else self._listen
@@ -129,7 +129,7 @@ class Rig:
         )  # fmt: skip
 
     def start_recorder(self) -> tuple[Process, Path]:
-        path = self._directory / f"{time.monotonic_ns()}.mcap"  # a disturbed try is done again
+        path = self._directory / f"{time.monotonic_ns()}.mcap"  # unique: a try may be repeated
         record = ("bridge", "record", "--out", str(path), "--connect", self._hub)
         return self._start(*record, "--vehicle-id", VEHICLE_ID, ready="recording"), path
 
@@ -138,7 +138,7 @@ class Rig:
         return self._start("bridge", "router", *ends)
 
     def switch(self, name: str, word: str | None) -> None:
-        """Write a word into one of the files that the faulty ends look at; None removes it."""
+        """Write a word into a switch file of the faulty ends; None removes the file."""
         path = self._directory / name
         path.unlink(missing_ok=True) if word is None else path.write_text(word)
 
@@ -157,7 +157,7 @@ class Rig:
         def driving() -> bool:
             nonlocal rearmed_s
             if self.has_vehicle and time.monotonic() - rearmed_s > _REARM_EVERY_S:
-                # A busy machine may have stopped it once more: the operator stays beside it.
+                # On a busy machine it may have stopped once more.
                 self.try_rearm()
                 rearmed_s = time.monotonic()
             since_s = time.monotonic() - _STEADY_PERIODS * self.period_s
@@ -190,7 +190,7 @@ class Rig:
 
     def recovered_after_s(self, ended_s: float) -> float:
         """Wait for the first drive command sent after the fault's end; return s until it came."""
-        # By its sending: what a relay held up was driven before.
+        # By its sending time: a command that a relay has held is older.
         drive = self._command(lambda c: c.sent_s > ended_s and c.mode == DRIVE)
         return drive.seen_s - ended_s
 
@@ -199,12 +199,12 @@ class Rig:
 
         def stop() -> tuple[float, str] | None:
             for seen_s, line in self.edge.lines:
-                if seen_s > since_s and (found := _STOPPED.search(line)):
-                    return seen_s, found[1] or ""
+                if seen_s > since_s and (match := _STOPPED.search(line)):
+                    return seen_s, match[1] or ""
             return None
 
-        found: tuple[float, str] = wait_until(stop, "safe_stop in the log")
-        return found
+        logged: tuple[float, str] = wait_until(stop, "safe_stop in the log")
+        return logged
 
     def last_drive_s(self) -> float:
         times = (c.seen_s for c in reversed(self.timeline.commands) if c.mode == DRIVE)
@@ -216,8 +216,8 @@ class Rig:
     def edge_counts(self) -> Counter[str]:
         """Return the edge's rejections by reason, counting all messages sent so far."""
         time.sleep(_HEALTH_S)
-        seen = len(self.timeline.health)
-        wait_until(lambda: len(self.timeline.health) > seen, "a health message")
+        count = len(self.timeline.health)
+        wait_until(lambda: len(self.timeline.health) > count, "a health message")
         return Counter(self.timeline.health[-1].rejected)
 
     def end_counts(self) -> Counter[str]:
@@ -229,12 +229,12 @@ class Rig:
 
     def _command(self, holds: Callable[[CommandSeen], bool]) -> CommandSeen:
         commands = self.timeline.commands
-        found: CommandSeen = wait_until(lambda: next(filter(holds, commands), None), "a command")
-        return found
+        command: CommandSeen = wait_until(lambda: next(filter(holds, commands), None), "a command")
+        return command
 
     def _start(self, *arguments: str, **options: Any) -> Process:
-        told = {inside.DIRECTORY: str(self._directory)}
-        return self._keep(Process(*arguments, environment=told, **options))
+        variables = {inside.DIRECTORY: str(self._directory)}
+        return self._keep(Process(*arguments, environment=variables, **options))
 
     def _keep(self, process: Process) -> Process:
         self._processes.append(process)
@@ -247,7 +247,7 @@ class Sender:
 
     def __init__(self, rig: Rig) -> None:
         self.step = self.episode = 0
-        self.ahead_ns = 0  # By how much its clock is set ahead
+        self.ahead_ns = 0  # Added to the stamps: a clock set ahead
         self.running = threading.Event()
         self.running.set()
         self.lock = threading.Lock()
@@ -284,27 +284,27 @@ class Sender:
 
 
 def noisy_state(step: int, task: Task, **changes: Any) -> State:
-    """Make a valid state of the task, which sees noise."""
-    seen = inside.noise(task, np.random.default_rng(step)).items()
+    """Make a valid state of the task, with noise as its observation."""
+    noise = inside.noise(task, np.random.default_rng(step)).items()
     fields: dict[str, Any] = {
         "session": "campaign", "episode": 0, "step": step, "speed_mps": 3.0, "final": False,
         "sim_time_s": round(step * task.control_period_s, 6), "sent_ns": time.time_ns(),
-        "observation": {name: value.tobytes() for name, value in seen},
+        "observation": {name: value.tobytes() for name, value in noise},
     }  # fmt: skip
     return State(**{**fields, **changes})
 
 
 class Chassis(Process):
-    """``python -m hil_tests mock_hunter`` beside a rig: its faults, and what it really did."""
+    """``python -m hil_tests mock_hunter`` beside a rig: its faults, and its true motion."""
 
     def __init__(self, bus: str) -> None:
         super().__init__("hil_tests", "mock_hunter", "--bus", bus, ready="ready")
 
     @property
     def truth(self) -> list[tuple[float, bool]]:
-        """Since when (monotonic s) it moves or stands, whatever it reports."""
-        told = (_TOLD.match(line) for _, line in self.lines)
-        return [(float(each[1]), each[2] == "moves") for each in told if each]
+        """Times (monotonic s) at which it began to move (True) or to stand, whatever it reports."""
+        matches = (_TOLD.match(line) for _, line in self.lines)
+        return [(float(each[1]), each[2] == "moves") for each in matches if each]
 
     @property
     def moves(self) -> bool:
@@ -319,7 +319,7 @@ class Chassis(Process):
         return float(line.split()[1].removeprefix("t="))
 
     def stands_s(self, since_s: float, timeout_s: float) -> float:
-        """Return when it stood, at or after a moment; TimeoutError where it goes on moving."""
+        """Return when it stood, at or after ``since_s``; TimeoutError if it goes on moving."""
         wait_until(lambda: not self.moves, "the vehicle to stand", timeout_s)
         return max(self.truth[-1][0], since_s)
 
@@ -329,7 +329,7 @@ class Chassis(Process):
 
 
 def free_bus() -> str:
-    """Return a bus of its own: Linux mixes buses that share a port, whatever their groups."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
-        one.bind(("", 0))
-        return f"udp_multicast:{MULTICAST_GROUP}:{one.getsockname()[1]}"
+    """Return a bus on a free port: Linux mixes buses that share a port, whatever their groups."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("", 0))
+        return f"udp_multicast:{MULTICAST_GROUP}:{probe.getsockname()[1]}"

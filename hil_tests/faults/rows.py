@@ -1,10 +1,10 @@
 """Faults of both ends, of the link between them, of the mock vehicle and of a recorder.
 
 A function takes a driving rig, does a fault once, undoes it, and returns a `Try`. A `Row` in ROWS
-says what it does, in words, and what is expected. `run.py` joins the tables.
+describes the fault and the expected reaction. `run.py` joins the tables.
 
-The last rows are of a drive with ride-through of RIDE_S: through what is shorter, nothing brakes;
-what is longer brakes RIDE_S later. A fault of the vehicle and a stop end it at once.
+The last rows are of a drive with ride-through of RIDE_S: a shorter outage brakes nothing, a longer
+one brakes RIDE_S later. A fault of the vehicle and a stop end the ride-through at once.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ from trainer.util import cores
 class Try:
     """One fault, done and undone.
 
-    ``reaction_s``: from the last good state or feedback to the safe stop on the wire (if that is
-    cut, in the log), or from the last drive command to the simulator's own brake; where the drive
-    goes on the longest gap between commands. ``recovery_s``: from the fault's end to the first
+    ``reaction_s``: from the last good state or feedback to the safe stop on the wire (if the wire
+    is cut, in the log), or from the last drive command to the simulator's own brake; if the drive
+    goes on, the longest gap between commands. ``recovery_s``: from the fault's end to the first
     drive command.
     """
 
     reaction_s: float | None = None
     recovery_s: float | None = None
     reason: str = ""
-    wrong: list[str] = field(default_factory=list)  # What was not as expected, beside the times
+    wrong: list[str] = field(default_factory=list)  # Deviations, besides the times
     rejected: Mapping[str, int] = field(default_factory=dict)
 
 
@@ -59,19 +59,19 @@ class Row:
     rig: Mapping[str, Any] = field(default_factory=dict)  # Options of the Rig
     policy: str = "given"  # ``given``, or one of `policies.POLICIES`.
     flows: bool = False
-    """Whether the simulator's states go on through the fault: where they do not, the machine stood
-    still, and the try is done again (and counted as disturbed)."""
+    """Whether the simulator's states go on through the fault: if they do not, the machine stalled,
+    and the try is repeated (and counted as disturbed)."""
     alone: bool = False  # Whether it needs the machine for itself
     goes_on: bool = False  # Whether the drive goes on through the fault
     counted: Literal["", "edge", "simulator"] = ""
-    """Who must have counted just the messages that a try sent to be rejected. The simulator tells
-    when the drive has ended: each try then has a rig of its own."""
+    """The end whose rejection counts must equal the messages that a try sent to be rejected. The
+    simulator reports at the drive's end, so each try then has a rig of its own."""
 
 
 def drives_on(
     name: str, done: str, run: Callable[[Rig], Try], expected: str = "drives on", **options: Any
 ) -> Row:
-    """Make a row of a fault through which the drive goes on; ``run`` tells what else is judged."""
+    """Make a row of a fault through which the drive goes on; ``run`` may judge more."""
     through = {"goes_on": True, "recovery_limit_s": None, "flows": True}
     return Row(name, done, expected, run, **{**through, **options})
 
@@ -81,14 +81,14 @@ STALLED_S = 0.6
 """Shorter than Zenoh's lease, so that the connection lives and brings all that it held at once. A
 T of more than 0.24 s needs a longer one."""
 SETTLED_S = 0.5
-"""So long the drive is steady first: a vehicle may lag behind what it was asked before."""
+"""Steady drive before a fault: a vehicle may lag behind its last set-point."""
 _FULL_AT_BYTES = 200_000  # Several of the recorder's chunks
 _CANNOT_WRITE = 1  # Exit status of a recorder that cannot write
 _FEWEST_STATES = 5
 
 
 def at_any_phase(rig: Rig) -> None:
-    """Wait a part of the control period, so that faults do not all come at the same moment."""
+    """Wait a random part of the control period, so that faults come at any phase of it."""
     time.sleep(float(np.random.default_rng(rig.number).uniform(0, rig.period_s)))
 
 
@@ -117,7 +117,7 @@ def edge_stopped(rig: Rig) -> Try:
 
 
 def _stopped_first(rig: Rig, since_s: float) -> list[str]:
-    """Return a line where what piled up meanwhile was driven on."""
+    """Return a line if commands to piled-up states were drives."""
     modes = (c.mode for c in rig.timeline.commands if c.sent_s > since_s)
     return ["drove on without a safe stop"] if next(modes, "") == DRIVE else []
 
@@ -126,16 +126,16 @@ def simulator_killed(rig: Rig) -> Try:
     begin_s, states = time.monotonic(), rig.timeline.states
     rig.simulator.kill()
     stop = rig.stop_command(begin_s)
-    last_s, known = rig.last_state_s(before_s=stop.seen_s), len(states)
+    last_s, count = rig.last_state_s(before_s=stop.seen_s), len(states)
     rig.simulator = rig.start_simulator()
-    ended_s = wait_until(lambda: [*states.values()][known:], "the new simulator's states")[0]
+    ended_s = wait_until(lambda: [*states.values()][count:], "the new simulator's states")[0]
     return Try(stop.seen_s - last_s, rig.recovered_after_s(ended_s), stop.reason)
 
 
 def _link_fails(
     rig: Rig, fail: Callable[[], None], restore: Callable[[], None], lasts_s: float = 0.0
 ) -> Try:
-    """Judge that both ends stop, and that nothing that was held up is driven on."""
+    """Judge that both ends stop, and that no state that was held up is driven on."""
     begin_s = time.monotonic()
     fail()
     stop_s, reason = rig.logged_stop(begin_s)
@@ -201,16 +201,16 @@ def _vehicle_is(word: str, rig: Rig) -> Try:
     begin_s = time.monotonic()
     rig.switch(VEHICLE, word)
     stop = rig.stop_command(begin_s)
-    # A silent vehicle may still speak between the mark and the switch, and what it says counts.
-    # What a stuck or lying vehicle says after the switch no longer counts.
+    # A silent vehicle may still report between begin_s and the switch, and that report counts.
+    # Reports of a stuck or lying vehicle after the switch do not count.
     end_s = stop.seen_s if word == "silent" else begin_s
     last_s = max(s for s, _ in rig.timeline.feedback if s < end_s)
     sleep_until(begin_s + LASTS_S)
-    said = any(f"vehicle_{word}" in line for seen_s, line in rig.edge.lines if seen_s > begin_s)
+    logged = any(f"vehicle_{word}" in line for seen_s, line in rig.edge.lines if seen_s > begin_s)
     rig.switch(VEHICLE, None)
     time.sleep(LASTS_S)
     wrong = rig.timeline.drives_between(stop.seen_s)
-    wrong += [] if said else [f"the log does not say vehicle_{word}"]
+    wrong += [] if logged else [f"the log does not say vehicle_{word}"]
     return Try(stop.seen_s - last_s, rig.drive_again(), stop.reason, wrong)
 
 
@@ -251,8 +251,8 @@ def _source_is(word: str, rig: Rig) -> Try:
     rig.switch(SOURCE, word)
     stop = rig.stop_command(begin_s)
     last_s = rig.last_state_s(before_s=stop.seen_s)
-    status, said = rig.simulator.wait(), rig.simulator.errors
-    wrong = [] if status == 1 and "has failed" in said else [f"status {status}: {said[-200:]!r}"]
+    status, text = rig.simulator.wait(), rig.simulator.errors
+    wrong = [] if status == 1 and "has failed" in text else [f"status {status}: {text[-200:]!r}"]
     rig.switch(SOURCE, None)
     rig.simulator = rig.start_simulator()
     rig.simulator.wait_for_line("ready")
@@ -263,10 +263,10 @@ def _source_is(word: str, rig: Rig) -> Try:
 
 def disk_full(rig: Rig) -> Try:
     recorder, path = rig.start_recorder()
-    # No file may grow beyond a limit: the same failing write as on a full disk.
+    # A limit of the file size makes writes fail as on a full disk.
     resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (_FULL_AT_BYTES, _FULL_AT_BYTES))
-    told = recorder.wait() == _CANNOT_WRITE and "error: recording" in recorder.errors
-    wrong = [] if told else [f"it said {recorder.errors[-200:]!r}"]
+    is_told = recorder.wait() == _CANNOT_WRITE and "error: recording" in recorder.errors
+    wrong = [] if is_told else [f"it said {recorder.errors[-200:]!r}"]
     return Try(wrong=wrong + _too_few(states_in(path)))
 
 
@@ -284,7 +284,7 @@ def recorder_killed(rig: Rig) -> Try:
 
 
 def states_in(path: Path) -> list[State]:
-    """Return the states that can be read from a recording, whole or torn."""
+    """Return the readable states of a recording, whole or torn."""
     wire = heard_of(Recording(path), VEHICLE_ID)
     states = (decode_state(heard.payload) for heard in wire if heard.topic == "state")
     return [state for state in states if isinstance(state, State)]
@@ -295,11 +295,11 @@ def _too_few(states: list[State]) -> list[str]:
 
 
 RIDE_S, SHORT_S, RIDING_S = 0.5, 0.4, 0.3
-"""How long it rides at most; an outage through which it rides; where in one it surely rides."""
+"""Longest ride-through; an outage that it covers; time into an outage at which it surely rides."""
 
 
 def _link_slows(periods: float, rig: Rig) -> Try:
-    """Judge that it stops though states go on coming, and that no late one is driven on."""
+    """Judge that it stops although states still come, and that no late one is driven on."""
     time.sleep(SETTLED_S)
     begin_s, state_bytes = time.monotonic(), len(encode(noisy_state(0, rig.task)))
     rig.relay.throttle(state_bytes / (periods * rig.period_s))
@@ -313,7 +313,7 @@ def _link_slows(periods: float, rig: Rig) -> Try:
 
 
 def _rides(rig: Rig, fail: Callable[[], None], restore: Callable[[], None]) -> Try:
-    """Judge that nobody brakes through a short outage, and that it drives on."""
+    """Judge that neither end brakes in a short outage, and that the drive goes on."""
     time.sleep(SETTLED_S)
     begin_s = time.monotonic()
     fail()
@@ -330,7 +330,7 @@ def _rides(rig: Rig, fail: Callable[[], None], restore: Callable[[], None]) -> T
 
 
 def _stops(reason: str, do: Callable[[Rig], Any] | None, rig: Rig) -> Try:
-    """Judge that it stops for what is done while it rides, and stays stopped."""
+    """Judge that it stops for ``do`` during a ride-through, and stays stopped."""
     time.sleep(SETTLED_S)
     begin_s = time.monotonic()
     rig.simulator.send(signal.SIGSTOP)
@@ -395,7 +395,7 @@ ROWS = [
     Row("vehicle_self_braking", "vehicle says that it brakes by itself while it is to drive",
         _REARM, partial(_vehicle_is, "self_braking"), **_STUCK,
         reaction_limit_s=REACTION_LIMIT_S + 0.1),
-    *(Row(f"source_{word}", f"a robot's own senses: observe() {does}; a new source",
+    *(Row(f"source_{word}", f"a robot's own sensors: observe() {does}; a new source",
           "edge sends safe_stop: no_fresh_state; stays until re-armed", partial(_source_is, word),
           policy="steady", rig={"vehicle": MOCK, "senses": True})
       for word, does in (("late", "takes 3 T"), ("hangs", "never ends"), ("raises", "raises"))),

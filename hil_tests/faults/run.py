@@ -1,4 +1,4 @@
-"""Runs rows of the fault table, several rigs at once, and gathers what each try gave."""
+"""Run rows of the fault table, several rigs at once, and report the tries."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from hil_tests.faults.rows import Row, Try, at_any_phase
 from hil_tests.processes import POLICY
 
 STALLED_PERIODS = 1.5
-"""States further apart than this are not the real-time drive that a row is about."""
+"""States further apart than this are no real-time drive: the machine has stalled."""
 MOST_DISTURBED = 100
 ROWS = [*rows.ROWS, *hunter.ROWS, *messages.ROWS, *bounds.ROWS]
 
@@ -34,7 +34,7 @@ class Outcome:
     tries: list[Try] = field(default_factory=list)
     unsafe: list[str] = field(default_factory=list)
     crashes: list[str] = field(default_factory=list)
-    disturbed: int = 0  # Tries in which the machine itself stood still, done again
+    disturbed: int = 0  # Tries in which the machine stalled, and which were repeated
 
 
 def run_faults(
@@ -49,8 +49,8 @@ def run_faults(
 
     ``on_try`` is called with the row's name after every try. UserError: the policy does not load.
     """
-    given = load_policy(policy, public_key, allow_unsigned=True).manifest
-    ended = threading.Event()  # No more tries are begun
+    manifest = load_policy(policy, public_key, allow_unsigned=True).manifest
+    ended = threading.Event()  # No more tries begin
     with tempfile.TemporaryDirectory(prefix="phil-faults-") as folder:
         policies = {"given": ["--policy", str(policy), "--allow-unsigned"]}
         policies["given"] += ["--public-key", public_key] if public_key else []
@@ -59,27 +59,27 @@ def run_faults(
             policies[kind] = ["--policy", str(path), "--allow-unsigned"]
 
         def do(row: Row) -> dict[str, Any]:
-            task, outcome = given if row.policy == "given" else TASK, Outcome()
+            task, outcome = manifest if row.policy == "given" else TASK, Outcome()
             while len(outcome.tries) < tries and not ended.is_set():
                 place = Path(tempfile.mkdtemp(dir=folder))
                 try:
                     rig = Rig(policies[row.policy], place, task, **row.rig)
-                except (OSError, UserError) as error:  # as where this machine has no multicast
+                except (OSError, UserError) as error:  # for example without multicast
                     outcome.tries.append(Try(wrong=[str(error)]))
                     break
                 use_rig(row, rig, outcome, tries, on_try, ended)
             return report_row(row, outcome, later_s(task))
 
-        found: dict[str, dict[str, Any]] = {}
+        by_name: dict[str, dict[str, Any]] = {}
         for alone in (False, True):
-            some = [row for row in chosen if row.alone == alone]
+            part = [row for row in chosen if row.alone == alone]
             with ThreadPoolExecutor(1 if alone else jobs) as pool:
                 try:
-                    found.update(zip((row.name for row in some), pool.map(do, some), strict=True))
+                    by_name.update(zip((row.name for row in part), pool.map(do, part), strict=True))
                 except BaseException:  # ^C, too
                     ended.set()
                     raise
-    reports = [found[row.name] for row in chosen]
+    reports = [by_name[row.name] for row in chosen]
     return {
         "tries": tries,
         "rows": reports,
@@ -97,7 +97,7 @@ def use_rig(
     on_try: Callable[[str], None],
     ended: threading.Event,
 ) -> None:
-    """Do tries of a row with a rig until all are done, or it hangs or cannot be used again."""
+    """Do tries of a row with a rig until all are done, or the rig hangs or is used up."""
     with rig:
         usable = True
         while usable and len(outcome.tries) < tries and not ended.is_set():
@@ -107,7 +107,7 @@ def use_rig(
                 at_any_phase(rig)
                 begin_s = time.monotonic()
                 done, usable = do_fault(row, rig), row.counted != "simulator"
-            except (OSError, UserError) as error:  # a time-out, or a process that is gone
+            except (OSError, UserError) as error:  # a time-out, or a process that has ended
                 done, usable = Try(wrong=[f"try {rig.number}: {error}"]), False
             gap_s = longest_gap_s(list(rig.timeline.flow_s), begin_s, time.monotonic())
             stalled = row.flows and gap_s > STALLED_PERIODS * rig.period_s
@@ -121,7 +121,7 @@ def use_rig(
 
 
 def do_fault(row: Row, rig: Rig) -> Try:
-    """Do the fault of a row once, and judge it where the drive was to go on."""
+    """Do the fault of a row once; if the drive must go on, judge that, too."""
     before = rig.edge_counts() if row.counted == "edge" else Counter()
     begin_s = time.monotonic()
     done = row.run(rig)
@@ -134,16 +134,16 @@ def do_fault(row: Row, rig: Rig) -> Try:
     if row.counted == "simulator":
         counted = rig.end_counts()
     wrong = [] if counted == wanted else [f"counted {dict(counted)}, sent {dict(wanted)}"]
-    # Safe stops come as steadily as drives: the gaps alone would not tell.
+    # Safe stops come as steadily as drives: the gaps alone would not show them.
     wrong += [*rig.timeline.stops_between(begin_s, end_s), *done.wrong]
     gap_s = rig.timeline.longest_gap_s(begin_s, end_s)
     return replace(done, reaction_s=gap_s, rejected=dict(counted), wrong=wrong)
 
 
 def report_row(row: Row, outcome: Outcome, later_s: float = 0.0) -> dict[str, Any]:
-    """Return a row of the report: spreads of the times, how many were late, and what was wrong.
+    """Return a row of the report: spreads of the times, counts of late tries, and deviations.
 
-    ``later_s``: how much longer 2 T is than 0.2 s; a recovery takes five states.
+    ``later_s``: by how much 2 T exceeds 0.2 s; a recovery takes five states, 2.5 times as much.
     """
     report: dict[str, Any] = {"name": row.name, "done": row.done, "expected": row.expected}
     report |= {"tries": len(outcome.tries), "disturbed": outcome.disturbed}

@@ -1,9 +1,9 @@
-"""``python -m hil_tests mock_hunter``: a Hunter of arithmetic on a CAN bus, with its faults.
+"""``python -m hil_tests mock_hunter``: a simulated Hunter on a CAN bus, with faults to switch on.
 
-`MockHunter` has no clock: frames and time in, frames out. `serve` runs it on a bus. CONTROL says
-who drives, BITS which errors stop it, FAULTS what can be switched on. The manual leaves open what
-follows when remote control or emergency stop lets go: here control goes back to where it was, which
-is the worst case.
+`MockHunter` has no clock: frames and time in, frames out. `serve` runs it on a bus. CONTROL is the
+table of who drives, BITS of the errors that stop it, FAULTS of the faults. The manual does not say
+who has control after the remote control or the emergency stop is released: here control goes back
+to where it was, which is the worst case.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from edge_runtime.vehicles.mapping import clamp
 class Bit(NamedTuple):
     """An error that the chassis shows in 0x211, by the driver's words for it.
 
-    It ``stops`` whoever drives; it ``latches`` until 0x441. Which do so is assumed.
+    ``stops``: it stops the vehicle; ``latches``: it stays until 0x441. Both are assumptions.
     """
 
     words: str
@@ -57,9 +57,9 @@ FAULTS: dict[str, str] = {
     "frozen": "it repeats its last frames, and obeys",
     "stuck": "its motors stay as they are, whatever is asked; its brake works",
     "full_lock": "its wheels go to full lock, whatever is asked",
-    "lying": "it reports a speed that cannot be",
-    "late": "all that it sends comes late",
-    "bus_off": "it neither sends nor hears",
+    "lying": "it reports an impossible speed",
+    "late": "all its frames come late",
+    "bus_off": "it neither sends nor receives",
     "remote": "the remote control takes over, its sticks at rest",
     "estop": "its emergency stop is pressed",
     **{name: bit.words for name, bit in BITS.items()},
@@ -69,11 +69,11 @@ LIE_MPS = 3.0
 
 
 class Control(StrEnum):
-    """Who drives. ``*_OVER_CAN``: the bus had control and gets it back."""
+    """Who drives. ``*_OVER_CAN``: the bus had control, and gets it back afterwards."""
 
     STANDBY = "standby"
     CAN = "can"
-    LINK_LOST = "link_lost"  # standby, for the commands stopped coming
+    LINK_LOST = "link_lost"  # standby, because commands stopped coming
     REMOTE = "remote"
     REMOTE_OVER_CAN = "remote_over_can"
 
@@ -83,7 +83,7 @@ CONTROL: dict[str, tuple[Control, ...]] = {
     # in:         standby, can, link_lost, remote, remote_over_can
     "0x421 = 1":         (_C, _C, _C, _R, _O),  # the remote control always outranks the bus
     "0x421 = 0":         (_S, _S, _S, _R, _R),
-    "0x111":             (_S, _C, _C, _R, _O),  # the trap: link_lost, and nobody asked
+    "0x111":             (_S, _C, _C, _R, _O),  # the trap: from link_lost to can, unasked
     "time-out":          (_S, _L, _L, _R, _O),
     "remote takes over": (_R, _O, _O, _R, _O),
     "remote lets go":    (_S, _C, _L, _S, _C),
@@ -91,14 +91,14 @@ CONTROL: dict[str, tuple[Control, ...]] = {
 """Event -> the state after it, for each state before it in the order of `Control`."""
 
 STANDS_MPS = 0.005
-"""Slower than this it stands: half of what one count in 0x221 could show is 0.0005."""
+"""Slower than this it stands; half a count of 0x221 is 0.0005."""
 FAST_S = 0.02
-SLOW_EVERY = 5  # Frames of 100 ms go with every fifth of those of 20 ms
+SLOW_EVERY = 5  # The 100 ms frames go with every fifth of the 20 ms frames
 STEP_S = 0.005
 REST = WheelMotion(0.0, 0.0)
-_LONGEST_GAP_S = 10.0  # After a longer pause of the process it has long come to its rest
+_LONGEST_GAP_S = 10.0  # In a longer pause of the process it comes to rest
 _BATTERY_V = 27.9
-# The motors stand and are well, whatever 0x211 and 0x221 show.
+# The motors report a stand and no fault, whatever 0x211 and 0x221 show.
 _MOTOR_FAST = protocol.MotorFast(speed_rpm=0, current_a=1.0, pulses=0)
 _MOTOR_SLOW = protocol.MotorSlow(_BATTERY_V, driver_c=35, motor_c=35, status=1 << 6)
 _FAULT_BITS = {words: mask for mask, words in protocol.PROFILES["v2"].items()}
@@ -112,12 +112,12 @@ class Parameters:
     max_speed_mps: float
     max_inner_rad: float
     command_timeout_s: float = 0.5
-    # Assumed, since the manual says nothing of the actuators: measure them.
+    # Assumed, because the manual does not describe the actuators: measure them.
     dead_time_s: float = 0.03  # From a command on the bus to the first movement of an actuator
     speed_time_constant_s: float = 0.1
     acceleration_mps2: float = 2.0
     braking_mps2: float = 3.0
-    """Of the speed controller, and of the brake: the chassis stops a moving car with either."""
+    """Deceleration by the speed controller, and by the brake."""
     steering_rate_radps: float = 1.0
 
 
@@ -137,7 +137,7 @@ class MockHunter:
         self.control, self.brake_locked, self.faults = Control.STANDBY, True, set[str]()
         self.errors: set[str] = set()  # of BITS, as it shows them
         self.speed_mps = self.inner_rad = 0.0
-        self.sticks = REST  # of the remote control: what the person asks for
+        self.sticks = REST  # of the remote control: the person's request
         self.next_s = now_s
         self._parameters, self._now_s = parameters, now_s
         self._commanded_s = -math.inf  # when the newest 0x111 came, or CAN control was taken
@@ -166,7 +166,7 @@ class MockHunter:
         return self.control is Control.CAN and may_drive
 
     def describe(self) -> str:
-        """Describe its state in a line that only changes when something happens."""
+        """Describe the discrete state in a line, which changes only with that."""
         return (
             f"control={self.control} state={self.state}"
             f" brake={'locked' if self.brake_locked else 'released'}"
@@ -197,7 +197,7 @@ class MockHunter:
             self.errors &= self.faults
 
     def switch(self, name: str, on: bool, now_s: float) -> None:
-        """Switch a fault. An error that does not latch goes with its cause."""
+        """Switch a fault. An error that does not latch ends with its cause."""
         self.advance(now_s)
         (self.faults.add if on else self.faults.discard)(name)
         if name in BITS and on:
@@ -208,17 +208,17 @@ class MockHunter:
             self._change_control("remote takes over" if on else "remote lets go")
 
     def due(self, now_s: float) -> list[Sent]:
-        """Return the frames to send now; after a pause one report, not one a missed period."""
+        """Return the frames to send now; after a pause one report, not one per missed period."""
         self.advance(now_s)
         if now_s >= self.next_s:
             self._report(now_s)
             self._tick += 1
             missed = int((now_s - self.next_s) / FAST_S)
             self.next_s += (missed + 1) * FAST_S
-        found = []
+        frames = []
         while self._outgoing and self._outgoing[0][0] <= now_s:
-            found.append(self._outgoing.popleft()[1])
-        return found
+            frames.append(self._outgoing.popleft()[1])
+        return frames
 
     def advance(self, now_s: float) -> None:
         self._now_s = max(self._now_s, now_s - _LONGEST_GAP_S)
@@ -241,7 +241,7 @@ class MockHunter:
         if in_hand := remote and self.state == protocol.STATE_OK and self.sticks != REST:
             self._setpoint = self.sticks
         if not (in_hand or self.obeys):
-            # Where control comes back, it does so from a stand, not with what was asked before.
+            # If control comes back, it begins at a stand, not with the last set-point.
             self._setpoint = WheelMotion(0.0, self.inner_rad)
             self.speed_mps -= clamp(self.speed_mps, p.braking_mps2 * step_s)
         elif "stuck" not in self.faults:
@@ -287,7 +287,7 @@ EXAMPLE = examples(
 )
 _tell = partial(print, flush=True)
 Orders = queue.SimpleQueue[tuple[str, bool | WheelMotion]]
-"""A fault's name, and whether it is switched on; or STICKS, and where they are."""
+"""A fault's name, and whether it is switched on; or STICKS, and their position."""
 STICKS = "sticks"
 
 
@@ -295,12 +295,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         f"{parser.description} "
         "Faults are switched while it runs by lines on its standard input: NAME on, NAME off."
-        f" Known are {', '.join(FAULTS)}. `{STICKS} MPS RAD` is what a person with the remote"
-        " control asks for while that has taken over (RAD: of the inner wheel, left above 0)."
+        f" Names are {', '.join(FAULTS)}. `{STICKS} MPS RAD` is the request of a person with the"
+        " remote control while that has taken over (RAD: of the inner wheel, above 0 to the left)."
     )
     add = parser.add_argument
-    add("--bus", default=MULTICAST_BUS, metavar="INTERFACE:CHANNEL", help="where it is")
-    add("--model", default="hunter-2.0", choices=list(MODELS), help="which Hunter")
+    add("--bus", default=MULTICAST_BUS, metavar="INTERFACE:CHANNEL", help="CAN bus to join")
+    add("--model", default="hunter-2.0", choices=list(MODELS), help="model of the Hunter")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -316,7 +316,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def serve(hunter: MockHunter, bus: can.BusABC, orders: Orders, ending: threading.Event) -> None:
     """Run a mock on a bus; print every change as one line with its time (monotonic)."""
-    said = ""
+    printed = ""
     while not ending.is_set():
         while not orders.empty():
             (name, on), now_s = orders.get(), time.monotonic()
@@ -325,19 +325,19 @@ def serve(hunter: MockHunter, bus: can.BusABC, orders: Orders, ending: threading
                 continue
             hunter.switch(name, on, now_s)
             _tell(f"fault t={now_s:.6f} {name}={'on' if on else 'off'}")
-        for frame, data in hunter.due(time.monotonic()):
-            message = can.Message(arbitration_id=frame.can_id, data=data, is_extended_id=False)
+        for row, data in hunter.due(time.monotonic()):
+            message = can.Message(arbitration_id=row.can_id, data=data, is_extended_id=False)
             with contextlib.suppress(can.CanError):  # the driver notices
                 bus.send(message)
-        if (words := hunter.describe()) != said:
-            said = words
+        if (words := hunter.describe()) != printed:
+            printed = words
             _tell(f"chassis t={time.monotonic():.6f} {words}")
-        with contextlib.suppress(can.CanError):  # what a socket cannot unpack is no frame
-            heard = bus.recv(max(0.0, hunter.next_s - time.monotonic()))
-            if heard is None or heard.is_extended_id or heard.is_remote_frame or heard.is_fd:
+        with contextlib.suppress(can.CanError):  # data that is no frame
+            frame = bus.recv(max(0.0, hunter.next_s - time.monotonic()))
+            if frame is None or frame.is_extended_id or frame.is_remote_frame or frame.is_fd:
                 continue  # the chassis has data frames with an 11-bit identifier only
-            if not heard.is_error_frame:
-                hunter.receive(heard.arbitration_id, bytes(heard.data), time.monotonic())
+            if not frame.is_error_frame:
+                hunter.receive(frame.arbitration_id, bytes(frame.data), time.monotonic())
 
 
 def _read_orders(orders: Orders) -> None:

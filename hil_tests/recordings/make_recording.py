@@ -1,7 +1,7 @@
-"""Drive and record anew what the next release is replayed against: ``make recording``.
+"""Make the recording that the tests replay anew: ``make recording``.
 
-Four left turns in lock-step, and one in real time with an outage of half a second. There the edge
-runtime must go into safe stop, and drive again after five states.
+It holds four left turns in lock-step, and one in real time with an outage of half a second, in
+which the edge runtime must go into safe stop, and drive again after five states.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ LAST = ("--seed", EPISODES, "--clock", "realtime", "--latency", "outage=0.5s@2s"
 
 
 def make_recording(_: object) -> int:
-    """Make the recording and check it by replay; the old one stays where anything goes wrong."""
+    """Make the recording and check it by replay; keep the old one if anything fails."""
     endpoint = free_endpoint()
     simulate = ("bridge", "simulate", "--env", "left_turn", "--listen", endpoint)
     with tempfile.TemporaryDirectory() as folder:
