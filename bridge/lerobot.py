@@ -81,7 +81,7 @@ def _export(drive: RecordedDrive, folder: Path) -> int:
     """Write the data set and return its number of frames; UserError where no state was answered."""
     task = drive.task
     if task is None:
-        raise UserError(f"{drive.recording.path} holds no scene with a task to read the states by")
+        raise UserError(f"{drive.recording.path} holds no scene that says how to read the states")
     for name in task.observation:
         if not re.fullmatch(r"[\w -]{1,64}", name):  # It becomes part of a path.
             raise UserError(f"the observation {name!r} cannot be the name of a feature")

@@ -179,7 +179,7 @@ def try_policy(
         over = terminated or truncated
     widest = max(1.0, *(max(-row.low, row.high) for row in policy.manifest.action))
     if not max(apart) <= TOLERANCE * widest:
-        raise UserError(f"its own library answers differently, by {max(apart):.1e}")
+        raise UserError(f"the answers of its own library differ by {max(apart):.1e}")
     if not act and max(answers) <= 1.0 + TOLERANCE < widest:
         warn("all its answers lie within -1 to 1, and the range is wider: does it scale them?")
     if (reach := np.median(reaches)) > BEARABLE:

@@ -114,7 +114,7 @@ def of_a_module(topic, message):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (a_pixel, "at step 12 (1.2 s) the observation is another than recorded"),
+        (a_pixel, "at step 12 (1.2 s) the observation differs from the recorded one"),
         (an_action, "at step 7 (0.7 s) the "),
         (without_a_scene, "is known for 0.8 s"),
         (without_origins, "holds 0 drives"),

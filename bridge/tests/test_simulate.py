@@ -361,7 +361,7 @@ def test_an_observation_that_is_not_of_its_spaces_numbers_is_refused(monkeypatch
     monkeypatch.setattr(made.unwrapped, "shown", given)
     seen, _ = made.reset(seed=0)
     adapter = Adapter(made, describe(made))
-    with contextlib.nullcontext() if fits else pytest.raises(UserError, match="it is to be uint8"):
+    with contextlib.nullcontext() if fits else pytest.raises(UserError, match="it must be uint8"):
         assert adapter.pack(seen)["observation"] == np.array(given, np.uint8).tobytes()
 
 
