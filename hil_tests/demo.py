@@ -70,8 +70,8 @@ def train(folder: Path) -> None:
     print("\n2  PHIL-TD3 learns to drive; the human model takes over when it must")
     settings = [word for setting in SETTINGS for word in ("--set", setting)]
     settings += ["--resume"] * (run_dir / "config.json").exists()
-    words = ("--human", human_dir, "--seed", 1, *TRAINING, *settings)
-    run_command("trainer", "train", "--out", run_dir, *words)
+    options = ("--human", human_dir, "--seed", 1, *TRAINING, *settings)
+    run_command("trainer", "train", "--out", run_dir, *options)
 
 
 def drive(folder: Path, trust: tuple[str, ...]) -> dict[str, dict[str, Any]]:

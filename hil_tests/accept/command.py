@@ -81,11 +81,11 @@ def judge(job: Job) -> int:
 
 def load_settings(path: str | None, quick: bool) -> Any:
     """Read a file over the defaults. UserError for an unknown key or fault, or a wrong value."""
-    table = {**_KNOWN, **(read_toml(path, "settings") if path else {})}
+    values = {**_KNOWN, **(read_toml(path, "settings") if path else {})}
     try:
-        settings = convert(table, Settings)
+        settings = convert(values, Settings)
         if quick:
-            settings = convert({**table, **_KNOWN["quick"], **settings.quick}, Settings)
+            settings = convert({**values, **_KNOWN["quick"], **settings.quick}, Settings)
         choose(",".join(settings.faults), "faults")
         return settings
     except UserError as error:

@@ -147,11 +147,11 @@ class Probe:
         match DECODERS[topic](bytes(sample.payload)):
             case wire.State() as state:
                 timeline.note_state(state, seen_s)
-            case wire.Command() as command:
+            case wire.Command(mode=mode, action=action, reason=reason) as command:
                 place = (command.session, command.episode, command.step)
-                stamps = seen_s, (command.sent_ns - offset_ns) * 1e-9
-                answer = command.mode, command.action, command.reason
-                timeline.commands.append(CommandSeen(*stamps, place, *answer))
+                sent_s = (command.sent_ns - offset_ns) * 1e-9
+                seen = CommandSeen(seen_s, sent_s, place, mode, action, reason)
+                timeline.commands.append(seen)
             case wire.Feedback() as feedback:
                 timeline.feedback.append((seen_s, feedback))
             case wire.Health() as health:
