@@ -1,4 +1,4 @@
-"""A vehicle of arithmetic: dead time, rate limit and first-order lag before the wheels obey.
+"""A simulated vehicle: dead time, rate limit and first-order lag before the wheels obey.
 
 It integrates its motion up to the time it is asked about, and needs no thread.
 """
