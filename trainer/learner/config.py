@@ -1,6 +1,6 @@
 """Algorithms as rows of a table of switches, and hyper-parameters.
 
-The hyper-parameters are tables A5 and A6, what differs from them, and what the paper leaves open.
+The hyper-parameters are those of tables A5 and A6, our changes, and values that the paper omits.
 """
 
 from __future__ import annotations
@@ -29,27 +29,27 @@ class Algorithm:
     human_td_weight: float = 1.0
     """Weight of |delta| in the priority of the human's transitions."""
     separate_buffers: bool = False
-    """The human's transitions and the policy's lie in a buffer each (section VII-A: RD2); each is
-    drawn from as often as its share of all transitions."""
+    """Human and policy transitions have a buffer each (section VII-A: RD2); a minibatch draws from
+    each in proportion to its size."""
     advantage_weight: float = 1.0
     """Weight of the Q advantage in the priority of the human's transitions (eq. 21)."""
     weighted_cloning: bool = False
-    """An imitated action counts the less, the more the critic prefers the policy's own."""
-    q_term: bool = True  # The actor climbs the critic (eq. 23, first term)
+    """The more the critic prefers the policy's action, the less a human's is imitated."""
+    q_term: bool = True  # The actor maximises the critic's value (eq. 23, first term)
     rewarded: bool = True
-    """The environment's reward counts. Without it only take-overs count, and every one does, even
+    """The environment's reward counts. Without it only take-overs count, all of them, even those
     from a car that waits too long."""
     proxy_values: bool = False
     """The critics learn the values 1 for the human's action and -1 for the overruled one."""
-    human_share: float = 0.0  # Of each minibatch; 0: as the priorities have it
+    human_share: float = 0.0  # Human share of each minibatch; 0: by priority
     asks: float = 0.0
-    """Share of the steps, those in which its critics disagree most, in which the robot asks for
-    help; 0: the human watches, and takes over without being asked."""
+    """Share of the steps in which the robot asks for help, those where its critics disagree most;
+    0: the human watches, and takes over without being asked."""
     foresight: int = 0
-    """Steps ahead in which the actor learns to prefer the human's action to the overruled one, by a
-    further loss; 0: none."""
+    """Number of predicted steps in which a further loss prefers the human's action to the overruled
+    one; 0: no such loss."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Hyper-parameters of this row in place of the common ones: its paper's, where ours do not
+    """Hyper-parameters that replace the common ones in this row: its paper's, where ours do not
     fit."""
 
 
@@ -83,7 +83,7 @@ ALGORITHMS: dict[str, Algorithm] = {
     "phil_q_advantage_only": replace(PHIL, human_td_weight=0.0),
     "phil_advantage_0.1": replace(PHIL, advantage_weight=0.1),
     "phil_advantage_100": replace(PHIL, advantage_weight=100.0),
-    # For humans who err: by both settings few wrong actions count little, and none for ever.
+    # For humans who err: the settings limit how much, and how long, a few wrong actions count.
     "phil_weighted": replace(
         PHIL,
         weighted_cloning=True,
@@ -106,7 +106,7 @@ ALGORITHMS: dict[str, Algorithm] = {
     "pvp4real_td3": replace(PVP, behaviour_cloning=True),
     # RLPD (2302.02948): demonstrations come first; a human may also take over, as in HIL-SERL
     # (2410.21845). No cloning, no penalty. Two critics, not ten, and two updates a step, not 20:
-    # so few never carried a far goal back by one-step targets, hence the returns of all rows.
+    # with so few, one-step targets never carried back a far goal, hence the returns of all rows.
     # Without failures of its own the critics rate every action good.
     "rlpd_td3": Algorithm(
         penalty=False, behaviour_cloning=False, advantage_weight=0.0, human_share=0.5,
@@ -122,12 +122,12 @@ ALGORITHMS: dict[str, Algorithm] = {
     ),
     # The robot asks where its critics disagree, with a budget, as in ThriftyDAgger (2109.08273);
     # AIM (2506.09176) trains a critic of its own for that. Until 500 doubts are known the human
-    # watches; only its objections of that time are penalised.
+    # watches; only take-overs of that time are penalised.
     "phil_gated": replace(PHIL, asks=0.05, settings={"cloning_weight": 10.0}),
 }  # fmt: skip
 """Command-line name -> switches. The first six are the paper's, the next six take PHIL-TD3 apart,
 and the others are other authors' methods and our own."""
-PLUGIN_GROUP = "phil.algorithms"  # Entry points that are rows of their own
+PLUGIN_GROUP = "phil.algorithms"  # Entry points of other packages' rows
 
 
 def find_algorithm(name: str) -> Algorithm:
@@ -137,46 +137,46 @@ def find_algorithm(name: str) -> Algorithm:
     """
     if name in ALGORITHMS:
         return ALGORITHMS[name]
-    places = list(entry_points(group=PLUGIN_GROUP, name=name))
-    if not places and ":" in name:
-        places = [EntryPoint(name, name, PLUGIN_GROUP)]
-    if not places:
+    rows = list(entry_points(group=PLUGIN_GROUP, name=name))
+    if not rows and ":" in name:
+        rows = [EntryPoint(name, name, PLUGIN_GROUP)]
+    if not rows:
         plugged = entry_points(group=PLUGIN_GROUP).names
         known = ", ".join([*ALGORITHMS, *sorted(plugged)])
-        raise UserError(f"no algorithm {name!r}; there is {known}, or module:ROW")
+        raise UserError(f"no algorithm {name!r}; known are {known}, or module:ROW")
     try:
-        row = places[0].load()
+        row = rows[0].load()
     except Exception as error:  # A module may raise anything when it is imported.
         raise UserError(f"no algorithm {name!r}: {type(error).__name__}: {error}") from error
     if not isinstance(row, Algorithm):
-        raise UserError(f"{name!r} is no Algorithm of trainer.learner.config")
+        raise UserError(f"{name!r} is not an Algorithm of trainer.learner.config")
     return row
 
 
 @dataclass(frozen=True)
 class LearnerConfig:
-    """One field a hyper-parameter; the paper's value where the docstring names its table."""
+    """The learner's hyper-parameters, with the paper's table, and its value if it differs."""
 
     frames: int = 2
     """Newest frames that actor and critics see: eq. 28's two, or the tough setting's one."""
     batch_size: int = 128
     """Transitions in a minibatch (table A5: N)."""
     actor_learning_rate: float = 1e-4
-    """Of the actor's optimiser (table A5: 5e-4). Adam takes equally long steps for small gradients
-    and large ones, and once the actor has little left to learn, its gradient is the critics' error.
-    Five times as fast, it followed that error away from what it had learned."""
+    """Learning rate of the actor (table A5: 5e-4). Adam's steps do not shrink with the
+    gradient. Once the actor has little left to learn, its gradient is the critics' error; at five
+    times this rate it followed that error away from what it had learned."""
     critic_learning_rate: float = 1e-3
-    """Of the critics' (table A5: 2e-4). Normalised critics learn slower, and an actor should follow
-    critics that are ahead of it."""
+    """Learning rate of the critics (table A5: 2e-4). Normalised critics learn slower, and an actor
+    should follow critics that are ahead of it."""
     learning_rate_decay: float = 1.0
     """Factor on both learning rates, once an episode (table A5: 0.996). A decay by steps is
     fairer: a policy that fails early has many short episodes."""
     learning_rate_final: float = 0.0
     """Share of both learning rates at the end of the run, to which they fall linearly (the paper:
-    1). With rates that stay high, the late policy swings about what it learned."""
+    1). With rates that stay high, the late policy oscillates."""
     gamma: float = 0.95
-    """Discount factor of one control period (table A5). Default where T is below 0.1 s: that factor
-    in 0.1 s."""
+    """Discount factor of one control period (table A5). Default where T is below 0.1 s: the same
+    discount in 0.1 s."""
     return_steps: int = 8
     """Rewards that a target sums up before it bootstraps (n of n-step returns; Hessel et al.,
     2018); the paper has 1. Goal and failure are 30 to 70 steps away, and one-step targets hardly
@@ -194,23 +194,22 @@ class LearnerConfig:
     exploration_initial: float = 0.1
     """Standard deviation of the exploration noise at first (table A5: 1). With 0.3 the congestion
     is not learned: the noise alone makes the car crash, a return of several steps measures the
-    noise instead of the action, and a human takes over because of the noise. Default of a row
-    without a human where no picture is seen: 0.6, falling to 0.3."""
+    noise instead of the action, and a human takes over because of the noise. Default without
+    human and pictures: 0.6, falling to 0.3."""
     exploration_searching: float = 0.0
-    """Standard deviation until an episode first succeeds, where the environment says which do, or
-    until ``exploration_share`` is over; 0: as later. Default of a row without a human where no
-    picture is seen: 1."""
+    """Standard deviation until the first success, where the environment reports it, or until
+    ``exploration_share`` is over; 0: no such phase. Default without human and pictures: 1."""
     exploration_correlation: float = 0.9
     """Correlation of the noise in two successive steps (the paper: 0). A critic cannot see what a
     tenth of a second of steering does, but it sees a second of it: lasting noise shows what an
     action is worth (Ornstein-Uhlenbeck, as in DDPG; Lillicrap et al., 2016). Default where T
-    is below 0.1 s: that correlation over 0.1 s."""
+    is below 0.1 s: the same correlation over 0.1 s."""
     exploration_final: float = 0.05
     """Least standard deviation of the exploration noise (table A5)."""
     exploration_share: float = 0.5
-    """Share of the run in which the deviation falls linearly from the first to the least, by steps:
-    by episodes, a policy that fails early would stop exploring before it has learned anything. The
-    paper names no law."""
+    """Share of the run over which the deviation falls linearly from ``exploration_initial`` to
+    ``exploration_final``, counted in steps: in episodes, a policy that fails early would stop
+    exploring before it has learned anything. The paper gives no schedule."""
     exploration_bound: float = 1.0
     """Bound of the exploration noise (table A5: c)."""
     replay_capacity: int = 100_000
@@ -236,33 +235,32 @@ class LearnerConfig:
     """Weight of the behaviour cloning term (omega of eq. 23; no value in the paper). Chosen on
     single runs: with a small weight the policy forgot the human before the critic knew better."""
     cloning_share: float = 0.0
-    """Share of the run in which that weight falls linearly to 0; 0: it stays. A human who errs is
-    imitated to the end otherwise."""
+    """Share of the run over which the cloning weight falls linearly to 0; 0: it is constant, and a
+    human's errors are imitated to the end."""
     cloning_bound: float = 0.0
-    """Distance from the human's action beyond which the loss grows in proportion, no longer with
-    the square; 0: none. A few wrong actions then count little beside the right ones."""
+    """Distance from the human's action beyond which the cloning loss grows linearly instead of
+    quadratically; 0: never. A few wrong actions then count little beside the right ones."""
     cloning_batch_size: int = 0
-    """The human's transitions in a batch of its own, all drawn alike often, from which the actor
-    imitates by an optimiser of its own; 0: it imitates those of the common minibatch. Default where
-    no picture is seen: 128. Few labels are soon fitted exactly; from then on one optimiser for both
-    terms follows the critics' error alone, at full length, whatever the weights."""
+    """Size of a separate batch of human transitions, drawn uniformly, for cloning with a separate
+    optimiser; 0: cloning uses the common minibatch. Default without pictures: 128. Few labels are
+    soon fitted exactly; from then on a common optimiser follows the critics' error alone, at full
+    step length, whatever the weights."""
     cloning_learning_rate: float = 1e-3
-    """Of that optimiser."""
+    """Learning rate of the separate cloning optimiser."""
     fresh_actors: int = 0
-    """How often in a run, at even distances, a fresh actor that is fitted to all of the human's
-    actions takes the actor's place. One that began with few of them generalises worse (Ash and
-    Adams, 2020). Default where no picture is seen: 3."""
+    """How often in a run, evenly spaced, the actor is replaced by a fresh one fitted to all human
+    actions so far. An actor that began with few of them generalises worse (Ash and Adams, 2020).
+    Default without pictures: 3."""
     preference_beta: float = 0.1
-    """How sharply a preference tells two actions apart, per squared distance; the lower, the less
-    it minds that the better one is nearer already (2510.01545: beta)."""
+    """Sharpness of a preference, per squared distance (2510.01545: beta); with a low value the loss
+    keeps pulling when the actor is already nearer to the preferred action."""
     intervention_penalty: float = -10.0
-    """What an intervention costs (eq. 17: r_pen = r_fail)."""
+    """Penalty of an intervention (eq. 17: r_pen = r_fail)."""
     penalty_on: str = "overruled"
-    """Which action an intervention's penalty is charged to. ``overruled``: the policy's action that
-    made the human take over; the penalty becomes its value, a return of several steps ends there,
-    and its error, where it is the larger one, stands for |delta| in the transition's priority (eq.
-    21). ``human``: the human's own first action, as printed, which teaches the critic that rescuing
-    is as bad as crashing."""
+    """Action that the penalty is charged to. ``overruled``: the policy's action that made the human
+    take over; the penalty becomes its value, n-step returns end there, and its error, if larger,
+    replaces |delta| in the transition's priority (eq. 21). ``human``: the human's own first action,
+    as printed, which teaches the critic that rescuing is as bad as crashing."""
     action_bound: float = 0.25
     """Bound of the action's initial weights in the critics' first connected layer. 0: that of one
     more feature among 1,792 (0.02), as in the paper's networks; the action then hardly counts at
@@ -311,16 +309,16 @@ RANGES = {
 UNGUIDED_NUMBERS = {
     "exploration_searching": 1.0, "exploration_initial": 0.6, "exploration_final": 0.3,
 }  # fmt: skip
-"""Without a human only noise finds what pays, and where numbers are seen it does little harm."""
+"""Without a human only noise finds rewards, and without pictures it does little harm."""
 IMITATED_NUMBERS = {"cloning_batch_size": 128, "fresh_actors": 3}
-"""Numbers are cheap: imitation can have a batch of its own."""
+"""Observations of numbers are cheap, so cloning can have a batch of its own."""
 
 
 def task_settings(row: Algorithm, numbers: bool, period_s: float) -> dict[str, float]:
-    """Return the hyper-parameters that a task asks for, in place of the common ones.
+    """Return the hyper-parameters that replace the common ones in a task.
 
-    ``numbers``: no entry of its observation is a picture. ``period_s`` is T: discounting and noise
-    last as long, in seconds, as at 0.1 s; a longer period keeps the common ones.
+    ``numbers``: no entry of its observation is a picture. ``period_s`` is T: below 0.1 s,
+    discounting and noise last as many seconds as at 0.1 s; a longer period keeps the common ones.
     """
     shorter, usual = min(period_s / PERIOD_S, 1.0), LearnerConfig()
     names = ("gamma", "exploration_correlation")

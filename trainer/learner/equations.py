@@ -112,8 +112,8 @@ def critic_loss(
 def overruled_loss(values: Tensor, penalised: Tensor, penalty: float, weights: Tensor) -> Tensor:
     """Draw the values [n] of overruled actions towards the penalty, in ``penalised`` rows only.
 
-    Not in the paper, which lowers the reward of the human's own first action (eq. 17). One mean
-    over the batch.
+    Not in the paper, which lowers the reward of the human's own first action (eq. 17). The mean is
+    over the whole batch.
     """
     return (weights * penalised * (penalty - values).square()).mean()
 
@@ -121,8 +121,8 @@ def overruled_loss(values: Tensor, penalised: Tensor, penalty: float, weights: T
 def proxy_value_loss(human_values: Tensor, overruled_values: Tensor, human: Tensor) -> Tensor:
     """Return the mean of (Q(s, a_human) - 1)^2 + (Q(s, a_overruled) + 1)^2 over the batch [n].
 
-    Proxy value propagation (2502.03369): only the ``human`` rows add to it, and TD without a reward
-    carries these values on to the others.
+    Proxy value propagation (2502.03369): only ``human`` rows contribute; TD without a reward
+    propagates these values to the others.
     """
     losses = (human_values - 1.0).square() + (overruled_values + 1.0).square()
     return (human * losses).mean()
@@ -142,8 +142,8 @@ def behaviour_cloning_loss(
 ) -> Tensor:
     """Return the mean squared distance to the human's actions: eq. 23's second term, unweighted.
 
-    ``weights`` [n]: what each sample counts, in mean about 1. Beyond ``bound``, unless that is 0, a
-    distance counts in proportion (pseudo-Huber): then the actor learns what most of the human's
+    ``weights`` [n] are about 1 on average. Beyond ``bound``, unless that is 0, the loss grows
+    linearly with the distance (pseudo-Huber): the actor then learns what most of the human's
     actions in a state are, not their mean.
     """
     distances = (human_actions - actions).square().sum(dim=1)
@@ -166,8 +166,8 @@ def preference_loss(actions: Tensor, preferred: Tensor, overruled: Tensor, beta:
     A deterministic policy counts as a normal distribution around its ``actions``, so the logarithms
     differ as the squared distances do.
     """
-    nearer = (overruled - actions).square().sum(dim=1) - (preferred - actions).square().sum(dim=1)
-    return softplus(-beta * nearer).mean()
+    margin = (overruled - actions).square().sum(dim=1) - (preferred - actions).square().sum(dim=1)
+    return softplus(-beta * margin).mean()
 
 
 def _masked_mean(values: Tensor, mask: Tensor) -> Tensor:

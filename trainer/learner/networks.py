@@ -2,13 +2,13 @@
 
 Two 6x6 convolutions (6 and 16 filters), each followed by ReLU and 2x2 max pooling, then fully
 connected layers of 256, 128 and 64. Frames come as uint8 and are normalised to [0, 1] (eq. 28)
-inside the network, so that an exported policy needs no preprocessing. Observations other than the
-paper's two frames have other features before the same connected layers: pictures of any size those
-of `Convolutions`, numbers themselves, several entries the features of each.
+inside the network, so that an exported policy needs no preprocessing. Other observations
+than the paper's two frames get other features before the same connected layers: pictures of any
+size those of `Convolutions`, numbers their scaled values, several entries the features of each.
 
-Nearly all products are in `Picture`: the convolutions and the first connected layer's share of the
-picture. It follows the ``torch.autocast`` around it and is computed once a picture; the rest is
-small, and always in single precision.
+Nearly all multiplications are in `Picture`: the convolutions, and the first connected layer's
+product with the features. It follows the ``torch.autocast`` around it and is computed once per
+picture; the rest is small, and always in single precision.
 """
 
 import re
@@ -49,10 +49,10 @@ def bfloat16_is_faster(device_type: str) -> bool:
 HIDDEN = (256, 128, 64)
 FRAMES_SPACE = Box(0, 255, (2, *FRAME), np.uint8)
 """The paper's observation: frames [t-1, t]."""
-UNBOUNDED = 1e6  # A bound beyond this does not scale a number
-LEAST_SPREAD = 0.02  # Of half of a number's range
-MOST_SPREADS = 10.0  # A number further from its mean counts as that far
-SMALL_SIDE = 8  # A picture is halved until its sides are no longer than this
+UNBOUNDED = 1e6  # Bounds beyond this do not set a number's scale
+LEAST_SPREAD = 0.02  # Smallest spread, as a share of half of a number's range
+MOST_SPREADS = 10.0  # Scaled numbers are clipped to this
+SMALL_SIDE = 8  # A picture is halved until no side is longer than this
 
 
 def is_picture(dtype: Any, shape: tuple[int, ...]) -> bool:
@@ -101,8 +101,8 @@ class Trunk(nn.Module):
 class Numbers(nn.Module):
     """Numbers [batch, ...] of any type to [batch, features], each scaled to about [-1, 1].
 
-    At first by its bounds; `fit` scales it by what was seen. The ``channels`` of a grid have a
-    scale each, otherwise every number has one.
+    The scale is that of the space's bounds until `fit` takes it from observations. Each of the
+    ``channels`` of a grid has one scale; without channels each number has its own.
     """
 
     middle: Tensor
@@ -117,7 +117,7 @@ class Numbers(nn.Module):
         bounded = (low > -UNBOUNDED) & (high < UNBOUNDED) & (low < high)
         low, high = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
         self.least = torch.from_numpy(LEAST_SPREAD * (high - low) / 2).float()
-        """Least spread of each number; a smaller one would make noise of it."""
+        """Smallest spread of each number to divide by; a smaller one would amplify noise."""
         self.register_buffer("middle", torch.from_numpy((low + high) / 2).float())
         self.register_buffer("reach", torch.from_numpy((high - low) / 2).float())
 
@@ -176,13 +176,13 @@ class Convolutions(nn.Module):
         return self.layers(scaled.reshape(-1, *self.shape))
 
     def _channels_first(self, seen: Tensor) -> Tensor:
-        # A copy, or gradients have the observation's strides, and a fused Adam takes them for the
-        # weights' own.
+        # Copied: otherwise gradients get the observation's strides, which a fused Adam mistakes for
+        # the weights'.
         return seen.permute(0, 3, 1, 2).contiguous() if self.last else seen.reshape(-1, *self.shape)
 
 
 class Entries(nn.Module):
-    """Features [batch, features] of several entries, a tensor each, one after the other."""
+    """Concatenates the features of several entries, a tensor each: [batch, features]."""
 
     def __init__(self, parts: list[Any]) -> None:
         super().__init__()
@@ -207,7 +207,7 @@ def make_trunk(space: Space[Any], frames: int) -> Any:
 
 
 def fit_numbers(network: nn.Module, observations: NDArray[Any]) -> None:
-    """Scale the numbers that a network sees by their spread in observations [n, ...]."""
+    """Fit the scales of a network's input numbers to observations [n, ...]."""
     seen = tensors(observations)
     for picture in (part for part in network.modules() if isinstance(part, Picture)):
         trunk = picture.trunk
@@ -218,12 +218,12 @@ def fit_numbers(network: nn.Module, observations: NDArray[Any]) -> None:
 
 
 class Picture(nn.Module):
-    """The observation's features, and their share of the first connected layer.
+    """The observation's features, and their product with the first connected layer's weights.
 
     Maps a tensor [batch, ...] for each entry to float32 [batch, 256], before the activation.
     ``frames`` is how many of the newest frames the network sees. The input is always the whole
-    observation, so that every network is run and exported alike. ``more_inputs`` of that layer,
-    beside the features, count in its initial weights.
+    observation, so that every network is run and exported alike. ``more_inputs``, the layer's
+    inputs beside the features, only scale its initial weights.
     """
 
     def __init__(
@@ -289,8 +289,8 @@ class Critic(nn.Module):
     """The value Q(s, a) (table A2): the action joins the picture's features.
 
     ``frames`` is how many of the newest frames it sees, ``action_bound`` the bound of the action's
-    initial weights (0: as one more feature among 1,792). ``normalised``: layer normalisation of the
-    picture's share of the first connected layer, and of each hidden layer.
+    initial weights (0: as one more feature among 1,792). ``normalised``: layer normalisation of
+    `Picture`'s output and of each hidden layer.
     """
 
     def __init__(

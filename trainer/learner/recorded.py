@@ -1,4 +1,4 @@
-"""A step of learning that a GPU records once and replays, without Python between its kernels."""
+"""Record a learning step on a GPU once, and replay it without Python between its kernels."""
 
 from collections.abc import Callable
 from functools import partial
@@ -8,14 +8,14 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_leaves, tree_map_only
 
-WARM_UPS = 3  # Calls that run as they are, so that libraries and optimisers have what they need
+WARM_UPS = 3  # Calls before the recording, in which libraries and optimisers allocate memory
 
 
 class RecordedStep:
-    """Calls ``step(batch)``, from the fourth call on by a replay of its kernels.
+    """Calls ``step(batch)``; from the fourth call on it replays the recorded kernels.
 
-    ``step`` branches on nothing that a tensor holds, and a batch's tensors, nested in named tuples
-    and lists, always have the same shapes. ``noise`` is the generator that it draws from.
+    ``step`` must not branch on a tensor's values. A batch's tensors, nested in named tuples and
+    lists, must always have the same shapes. ``noise`` is the generator that the step draws from.
     """
 
     def __init__(self, step: Callable[[Any], Tensor], noise: torch.Generator) -> None:
@@ -24,16 +24,16 @@ class RecordedStep:
         self._graph = torch.cuda.CUDAGraph()
 
     def __call__(self, batch: Any) -> Tensor:
-        """Begin the step on a batch that may lie in the processor's memory; return its result."""
-        here = torch.cuda.current_stream()
-        self._stream.wait_stream(here)
+        """Start the step on a batch, which may be in CPU memory; return its result."""
+        callers = torch.cuda.current_stream()
+        self._stream.wait_stream(callers)
         with torch.cuda.stream(self._stream):
             if not self._calls:
-                there = partial(torch.empty_like, device=self._noise.device)
-                self._batch = tree_map_only(Tensor, there, batch)
-            for own, given in zip(*map(tree_leaves, (self._batch, batch)), strict=True):
-                if own is not None:
-                    own.copy_(given)
+                allocate = partial(torch.empty_like, device=self._noise.device)
+                self._batch = tree_map_only(Tensor, allocate, batch)
+            for target, source in zip(*map(tree_leaves, (self._batch, batch)), strict=True):
+                if target is not None:
+                    target.copy_(source)
             if self._calls < WARM_UPS:
                 result = self._step(self._batch)
             else:
@@ -42,11 +42,11 @@ class RecordedStep:
                 self._graph.replay()
                 result = self._result.clone()
         self._calls += 1
-        here.wait_stream(self._stream)
+        callers.wait_stream(self._stream)
         return result
 
     def replay(self) -> None:
-        """Do the recorded step once more, on the same batch."""
+        """Replay the recorded step once more, on the same batch."""
         self._graph.replay()
 
     def _record(self) -> None:

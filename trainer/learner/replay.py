@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 
 Action = NDArray[np.float32]  # In [-1, 1], [action size]
 Observation = NDArray[Any]
-"""The two frames, or another environment's: of several entries a structured array."""
+"""The two frames, or another environment's array, structured if it has several entries."""
 Indices = NDArray[np.int64]
 
 
 class ReplayLayout(NamedTuple):
-    """How an observation lies in an array."""
+    """Shape and type of an observation's array."""
 
     shape: tuple[int, ...]
-    dtype: np.dtype[Any]  # Of several entries: a structured one
+    dtype: np.dtype[Any]  # A structured one for several entries
     stacked: bool = False
     """The observation is [older, newer], and its newer half is the next one's older half."""
 
@@ -49,10 +49,10 @@ class Transition:
     truncated: bool = False  # Whether the episode ends here although s' is not terminal
     human: bool = False  # Delta: whether the human acted
     overruled: Action | None = None
-    """The policy's action, which the human overruled where the human acted; None: ``action``."""
-    penalised: bool = False  # Whether an intervention begins that costs the policy (eq. 17)
+    """The policy's action, overruled where the human acted; None: the same as ``action``."""
+    penalised: bool = False  # Whether a penalised intervention begins here (eq. 17)
     foreseen: tuple[Observation, ...] = ()
-    """The observation, and those that the overruled action would have led to."""
+    """The observation, and those predicted for the overruled action; empty: no prediction."""
 
 
 @dataclass(frozen=True)
@@ -75,9 +75,9 @@ class Batch:
     """The policy's action where the human acted, else the action, [n, action size]."""
     penalised: NDArray[np.bool_]  # Whether the overruled action is penalised (eq. 17), [n]
     foreseen: Batch | None = None
-    """A second batch, whose ``next_frames`` overruled actions would have led to."""
+    """A second batch, whose ``next_frames`` are predictions for overruled actions."""
     shown: Batch | None = None
-    """A further batch, of the human's transitions alone, to imitate."""
+    """A further batch of human transitions alone, for cloning."""
 
 
 class ReplayBuffer:
@@ -95,14 +95,13 @@ class ReplayBuffer:
             its share of all (section VII-A: RD2).
         steps: maximum number of rewards that a drawn transition sums up (n of n-step returns).
         gamma: their discount factor.
-        overruled_value: value of a penalised action, with which a sum that reaches one ends; None:
-            the sum goes on with the human's action.
-        layout: of the observations.
+        overruled_value: value of a penalised action, with which an n-step return ends there; None:
+            the return goes on with the human's action.
+        layout: shape and type of the observations.
         human_share: share of the human's transitions in a minibatch once there are both kinds,
             which are then drawn separately; 0: not fixed.
-        foresees: also keep, and draw, the observations to which overruled actions would have led.
-        shown: number of the human's transitions that each minibatch draws besides, all alike
-            likely.
+        foresees: also store and draw the observations predicted for overruled actions.
+        shown: size of the further batch of human transitions, drawn uniformly; 0: none.
     """
 
     def __init__(
@@ -123,7 +122,7 @@ class ReplayBuffer:
         self.shown = shown
         self.steps, self.gamma, self.overruled_value = steps, gamma, overruled_value
         self.reward_scale = 1.0
-        """What a reward is multiplied by when it is drawn."""
+        """Factor on rewards when they are drawn."""
         self._largest_return, self._episode_rewards = 0.0, list[float]()
         self.added = self._frames_added = 0  # Since the run began
         self._oldest = 0  # Running number of the oldest transition that is not forgotten
@@ -141,7 +140,7 @@ class ReplayBuffer:
         self._penalised = np.zeros(capacity, np.bool_)
         self._priorities = np.zeros(capacity)
         self._weights = np.zeros(capacity)  # priority ** alpha; 0 where forgotten
-        self._apart = separate or human_share > 0.0
+        self._separate = separate or human_share > 0.0
         self._foreseen: ReplayBuffer | None = None
         if foresees:
             self._foreseen = ReplayBuffer(capacity, action_size, alpha=0.0, layout=layout)
@@ -171,7 +170,7 @@ class ReplayBuffer:
         return _mean(priorities[~human]), _mean(priorities[human])
 
     def end_episode(self) -> None:
-        """Let the next transition begin an episode: it does not follow the one before."""
+        """End the episode: the next transition does not follow the last one."""
         self._current = None
         self._largest_return, self._episode_rewards = self.largest_return, []
 
@@ -180,11 +179,11 @@ class ReplayBuffer:
         if self._current is None:
             self._current = self._begin(transition.observation)
         others = self._priorities[: self._used]
-        if self._apart:  # It enters one of two buffers, each with priorities of its own
+        if self._separate:  # Only the priorities of its own kind
             others = others[self._human[: self._used] == transition.human]
         priority = float(others.max(initial=0.0)) or 1.0
-        after = transition.next_observation
-        newest = self._add_picture(after[1] if self._stacked else after)
+        following = transition.next_observation
+        newest = self._add_picture(following[1] if self._stacked else following)
         slot = self.added % self.capacity
         self._frame_ids[slot] = *self._current, newest
         self._current = (*self._current[1:], newest)
@@ -207,7 +206,7 @@ class ReplayBuffer:
                 self._foreseen.add(ahead)
 
     def _begin(self, frames: Observation) -> tuple[int, ...]:
-        """Store the first observation of an episode; a picture seen twice once only."""
+        """Store an episode's first observation; two equal pictures only once."""
         if not self._stacked:
             return (self._add_picture(frames),)
         older = newer = self._add_picture(frames[0])
@@ -216,33 +215,33 @@ class ReplayBuffer:
         return older, newer
 
     def observations(self, most: int) -> NDArray[Any]:
-        """Return at most so many observations [n, ...], evenly from all that are not forgotten."""
+        """Return at most ``most`` stored observations [n, ...], evenly spaced by age."""
         return self._frames(self.alive[:: -(-len(self) // most)], 0)
 
     @property
     def largest_return(self) -> float:
         """Largest absolute discounted sum of rewards, unscaled, up to an episode's latest step."""
-        return max(self._largest_return, self._ended_return())
+        return max(self._largest_return, self._running_return())
 
-    def _ended_return(self) -> float:
-        """Largest such sum of the episode that is under way."""
-        after, largest = 0.0, 0.0
+    def _running_return(self) -> float:
+        """Return the largest such sum of the episode under way."""
+        discounted_sum, largest = 0.0, 0.0
         for reward in reversed(self._episode_rewards):
-            after = reward + self.gamma * after
-            largest = max(largest, abs(after))
+            discounted_sum = reward + self.gamma * discounted_sum
+            largest = max(largest, abs(discounted_sum))
         return largest
 
     def sample(self, count: int, random: np.random.Generator) -> Batch:
         """Draw a minibatch by priority."""
         batch = self._gather(self._draw(count, random))
-        if self._foreseen:  # there, and not empty
+        if self._foreseen:  # Neither None nor empty
             batch = replace(batch, foreseen=self._foreseen.sample(count, random))
         if self.shown and self.human_count:
             batch = replace(batch, shown=self.show(self.shown, random))
         return batch
 
     def show(self, count: int, random: np.random.Generator) -> Batch:
-        """Draw the human's transitions alone, all alike likely; there must be one."""
+        """Draw human transitions uniformly; there must be at least one."""
         humans = self.alive[self._human[self.alive]]
         return self._gather(random.choice(humans, count))
 
@@ -250,7 +249,7 @@ class ReplayBuffer:
         # Stratified: one draw from each of `count` equal parts.
         strata = (np.arange(count) + random.random(count)) / count
         weights, human = self._weights[: self._used], self._human[: self._used]
-        if not self._apart:
+        if not self._separate:
             return _find(weights, strata)
         # Strata over both kinds: each kind gets its share of the samples, to within one.
         policys_share = 1.0 - self._humans_share()
@@ -287,7 +286,7 @@ class ReplayBuffer:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take up what ``state_dict`` gave; the next transition begins an episode."""
+        """Restore a ``state_dict``; the next transition begins an episode."""
         self.added, self._oldest = state["added"], state["oldest"]
         self._frames_added = state["frames_added"]
         self.reward_scale, self._largest_return = state["reward_scale"], state["largest_return"]
@@ -324,12 +323,12 @@ class ReplayBuffer:
     ) -> tuple[NDArray[np.float32], Indices, NDArray[np.float32], NDArray[np.int64]]:
         """Sum up the n-step returns that begin with these transitions, without their bootstrap.
 
-        Returns, [n] each: the sums, the transitions that they end with, 1 where there is nothing to
-        bootstrap from, and the number of steps.
+        Returns, [n] each: the sums, the indices of their last transitions, 1 where nothing is
+        bootstrapped, and the number of steps.
 
-        A sum ends early at the episode's end, terminal or a timeout, and at the newest step. At an
-        overruled action that is penalised it ends without a bootstrap: the human's action there,
-        and its result, say nothing of the policy's actions before.
+        A sum ends early at the episode's end, terminal or a timeout, and at the newest step. At a
+        penalised overruled action it ends without a bootstrap: the human's action there, and its
+        result, say nothing about the policy's earlier actions.
         """
         scale = np.float32(self.reward_scale)
         sums: NDArray[np.floating] = scale * self._rewards[indices]
@@ -356,7 +355,7 @@ class ReplayBuffer:
 
     def _probabilities(self, indices: Indices) -> NDArray[np.float64]:
         weights, human = self._weights[: self._used], self._human[: self._used]
-        if not self._apart:
+        if not self._separate:
             return weights[indices] / weights.sum()
         share = self._humans_share()
         sums = (max(weights[own].sum(), 1e-300) for own in (~human, human))
@@ -365,8 +364,8 @@ class ReplayBuffer:
 
     def _humans_share(self) -> float:
         """The human's share of a minibatch where the two kinds are drawn separately."""
-        there = self.human_count / len(self)
-        return self.human_share if self.human_share and 0.0 < there < 1.0 else there
+        stored = self.human_count / len(self)
+        return self.human_share if self.human_share and 0.0 < stored < 1.0 else stored
 
     def _frames(self, slots: Indices, first: int) -> NDArray[Any]:
         """Gather s (``first`` is 0) or s' (1) of each transition, [n, 2, 45, 80]."""
@@ -374,32 +373,33 @@ class ReplayBuffer:
         return self._pictures[self._frame_ids[slots, pictures] % self._frame_slots]
 
     def _follows(self, slots: Indices, following: Indices) -> NDArray[np.bool_]:
-        """Whether each ``following`` begins with the picture that its transition ended with, [n].
+        """Whether each ``following`` continues its transition's episode, [n].
 
-        Pictures have running numbers, so none of another episode does, nor a forgotten transition.
+        It then begins with the picture that the transition ended with; pictures are numbered, so
+        no other episode's and no forgotten transition does.
         """
         return self._frame_ids[slots, -1] == self._frame_ids[following, -2]
 
     def _add_picture(self, picture: NDArray[Any]) -> int:
-        """Store a picture, forget transitions whose picture it replaces, and return its number."""
+        """Store a picture, forget transitions that used its slot; return the picture's number."""
         number = self._frames_added
         self._frames_added += 1
         self._pictures[number % self._frame_slots] = picture
-        gone, lost = number - self._frame_slots, []
-        while len(self) and self._frame_ids[self._oldest % self.capacity, 0] <= gone:
-            lost.append(self._oldest % self.capacity)
+        overwritten, forgotten = number - self._frame_slots, []
+        while len(self) and self._frame_ids[self._oldest % self.capacity, 0] <= overwritten:
+            forgotten.append(self._oldest % self.capacity)
             self._oldest += 1
-        if lost:
+        if forgotten:
             # A weight of 0, not 0 ** alpha, which is 1 where alpha is 0.
-            self._priorities[lost] = self._weights[lost] = 0.0
+            self._priorities[forgotten] = self._weights[forgotten] = 0.0
         return number
 
 
 def _find(weights: NDArray[np.float64], shares: NDArray[np.float64]) -> Indices:
-    """Find the indices in whose part of the weights' sum the shares (from 0, below 1) fall."""
+    """Return the indices at which the cumulative weights pass shares (0 to below 1) of the sum."""
     sums = np.cumsum(weights)
-    found = np.searchsorted(sums, shares * sums[-1], side="right")
-    return np.minimum(found, np.searchsorted(sums, sums[-1]))  # Rounding may lead beyond the last.
+    indices = np.searchsorted(sums, shares * sums[-1], side="right")
+    return np.minimum(indices, np.searchsorted(sums, sums[-1]))  # Rounding may exceed the last.
 
 
 def _mean(values: NDArray[np.float64]) -> float:

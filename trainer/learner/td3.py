@@ -34,35 +34,35 @@ class Losses(NamedTuple):
 
     @classmethod
     def of(cls, figures: Tensor) -> "Losses":
-        """Wait for what ``TD3Learner.begin`` gave."""
-        found = figures.double().cpu().numpy()
-        critic, policy, cloning, value = map(float, found[:4])
-        return cls(critic, policy, cloning, value, found[4:])
+        """Wait for the result of ``TD3Learner.begin`` and read it."""
+        numbers = figures.double().cpu().numpy()
+        critic, policy, cloning, value = map(float, numbers[:4])
+        return cls(critic, policy, cloning, value, numbers[4:])
 
 
 class Choices(NamedTuple):
     """Observations, the human's action in each, and the overruled one."""
 
-    seen: list[Tensor]
+    entries: list[Tensor]  # Of the observations
     actions: Tensor
     overruled: Tensor
 
 
 class Tensors(NamedTuple):
-    """What a step needs of a ``Batch`` of ``n``, each [n, ...]."""
+    """A ``Batch`` of ``n`` as tensors, each [n, ...]."""
 
-    seen: list[Tensor]
+    entries: list[Tensor]  # Of the observations
     actions: Tensor
     rewards: Tensor
-    next_seen: list[Tensor]
+    next_entries: list[Tensor]
     discount: Tensor  # gamma ^ spans
     terminals: Tensor
     human: Tensor
     importance: Tensor  # The weights of eq. 15
-    looked_at: Tensor  # Rows whose Q advantage is wanted
+    judged_rows: Tensor  # Rows whose Q advantage is computed
     overruled: Tensor | None
     penalised: Tensor
-    cloning_weight: Tensor  # Of this update, []
+    cloning_weight: Tensor  # In this update, []
     shown: Choices | None
     foreseen: Choices | None
 
@@ -74,11 +74,11 @@ def charges_overruled(config: LearnerConfig, algorithm: Algorithm) -> bool:
 
 NETWORKS = ("actor", "critics", "target_actor", "target_critics")
 OPTIMISERS = ("actor_optimiser", "critic_optimiser", "cloning_optimiser")
-MOST_BATCHES = 3000  # By which a fresh actor is fitted
+MOST_BATCHES = 3000  # Limit of the batches that a fresh actor is fitted to
 
 
 def _values(critics: networks.CriticPair, pictures: list[Tensor], actions: Tensor) -> list[Tensor]:
-    """Return Q_1 and Q_2, each [n], from the pictures that the two critics have embedded."""
+    """Return Q_1 and Q_2, each [n], from the two critics' embedded pictures."""
     pairs = zip(critics.pair, pictures, strict=True)
     return [critic.value(picture, actions) for critic, picture in pairs]
 
@@ -118,27 +118,28 @@ class TD3Learner:
         self.noise = torch.Generator(self.device).manual_seed(seed)
         self.updates = 0
         self.recorded: dict[tuple[bool, ...], RecordedStep] = {}
-        """Kind of step -> what a GPU replays; forgotten where optimisers get new tensors."""
-        self._fade = 1.0  # Of the weight on cloning
+        """Kind of step -> its GPU recording; cleared whenever optimisers get new tensors."""
+        self._cloning_fade = 1.0  # Factor on the cloning weight
         # bfloat16 has 8 bits of precision: enough for pixels, too few for numbers.
-        self._reduces = isinstance(space, Box) and networks.is_picture(space.dtype, space.shape)
+        self._only_pixels = isinstance(space, Box) and networks.is_picture(space.dtype, space.shape)
         self._charges_overruled = charges_overruled(config, algorithm)
 
     @torch.no_grad()
     def doubt(self, frames: NDArray[Any], action: NDArray[np.float32]) -> float:
         """Return |Q_1 - Q_2|, the critics' disagreement about an action in one observation."""
-        seen, actions = tensors(frames[None], self.device), self._tensor(action[None])
-        one, other = (critic.value(critic.picture(*seen), actions) for critic in self.critics.pair)
-        return float((one - other).abs())
+        entries, actions = tensors(frames[None], self.device), self._tensor(action[None])
+        pictures = [critic.picture(*entries) for critic in self.critics.pair]
+        first, second = _values(self.critics, pictures, actions)
+        return float((first - second).abs())
 
     def fit_numbers(self, observations: NDArray[Any]) -> None:
-        """Scale the numbers that all networks see by their spread in observations [n, ...]."""
+        """Fit the scales of all networks' input numbers to observations [n, ...]."""
         for name in NETWORKS:
             networks.fit_numbers(getattr(self, name), observations)
 
     @torch.no_grad()
     def rescale_values(self, factor: float) -> None:
-        """Multiply what the critics answer, after the unit of the rewards has changed."""
+        """Multiply the critics' outputs, after the unit of the rewards has changed."""
         for critic in (*self.critics.pair, *self.target_critics.pair):
             critic.head.output.weight.mul_(factor)
             critic.head.output.bias.mul_(factor)
@@ -148,7 +149,7 @@ class TD3Learner:
         return Losses.of(self.begin(batch, beta))
 
     def begin(self, batch: Batch, beta: float = 0.0) -> Tensor:
-        """Begin that step; on a GPU it goes on by itself until ``Losses.of`` waits for it."""
+        """Start that step; a GPU works on it until ``Losses.of`` waits for the result."""
         self.updates += 1
         with_policy = self.updates % self.config.policy_delay == 0
         prepared = self._prepare(batch, beta)
@@ -163,12 +164,12 @@ class TD3Learner:
     def _prepare(self, batch: Batch, beta: float) -> Tensors:
         """Turn a batch into tensors, in the processor's memory.
 
-        A processor leaves out what has no effect. A GPU's step is recorded, so it has one shape.
+        The CPU leaves out terms without effect. A GPU's step is recorded, so its shapes are fixed.
         """
-        c, column, everything = self.config, torch.from_numpy, self._on_gpu
-        charged = self._charges_overruled and (everything or batch.penalised.any())
-        valued = self.algorithm.proxy_values and (everything or batch.human.any())
-        judged = np.arange(len(batch.human)) if everything else np.flatnonzero(batch.human)
+        c, column, all_rows = self.config, torch.from_numpy, self._on_gpu
+        charged = self._charges_overruled and (all_rows or batch.penalised.any())
+        valued = self.algorithm.proxy_values and (all_rows or batch.human.any())
+        judged = np.arange(len(batch.human)) if all_rows else np.flatnonzero(batch.human)
         probabilities = column(batch.probabilities).float()
         shown, foreseen = batch.shown, batch.foreseen if self.algorithm.foresight else None
 
@@ -176,35 +177,34 @@ class TD3Learner:
             return Choices(tensors(frames), column(batch.actions), column(batch.overruled))
 
         return Tensors(
-            seen=tensors(batch.frames),
+            entries=tensors(batch.frames),
             actions=column(batch.actions),
             rewards=column(batch.rewards),
-            next_seen=tensors(batch.next_frames),
+            next_entries=tensors(batch.next_frames),
             discount=c.gamma ** column(batch.spans),
             terminals=column(batch.terminals),
             human=column(batch.human),
             importance=equations.importance_weights(probabilities, beta, c.normalise_importance),
-            looked_at=column(judged),
+            judged_rows=column(judged),
             overruled=column(batch.overruled) if charged or valued else None,
             penalised=column(batch.penalised),
-            cloning_weight=torch.tensor(self._fade * c.cloning_weight),
+            cloning_weight=torch.tensor(self._cloning_fade * c.cloning_weight),
             shown=None if shown is None else choices(shown.frames, shown),
             foreseen=None if foreseen is None else choices(foreseen.next_frames, foreseen),
         )
 
     def _step(self, batch: Tensors, with_policy: bool) -> Tensor:
         """Take a step; return the four losses and the batch's new priorities, [4 + n]."""
-        batch = batch._replace(
-            seen=self._shifted(batch.seen), next_seen=self._shifted(batch.next_seen)
-        )
+        entries, next_entries = self._shifted(batch.entries), self._shifted(batch.next_entries)
+        batch = batch._replace(entries=entries, next_entries=next_entries)
         targets = self._targets(batch)
         with self._precision():
-            pictures = [critic.picture(*batch.seen) for critic in self.critics.pair]
-            own_picture = self.actor.picture(*batch.seen)
+            pictures = [critic.picture(*batch.entries) for critic in self.critics.pair]
+            own_picture = self.actor.picture(*batch.entries)
         critic_loss, errors, value = self._critic_loss(batch, pictures, targets)
-        score = self.actor.head(own_picture)
-        own_actions = torch.tanh(score)
-        judged = self._judge(batch.seen, batch.actions, batch.looked_at, own_actions.detach())
+        pre_tanh = self.actor.head(own_picture)
+        own_actions = torch.tanh(pre_tanh)
+        judged = self._judge(batch.entries, batch.actions, batch.judged_rows, own_actions.detach())
         policy = self._policy_loss(pictures[0].detach(), own_actions, batch.human)
         cloning = self._cloning_loss(batch, own_actions, judged)
         priorities = self._priorities(errors, judged, batch.human)
@@ -213,17 +213,19 @@ class TD3Learner:
 
         _differentiate(critic_loss, self.critics)
         if with_policy:
-            self._step_actor(batch, policy, cloning, score)
+            self._step_actor(batch, policy, cloning, pre_tanh)
         self.critic_optimiser.step()
         if with_policy:
             self._update_targets()
         losses = torch.stack([critic_loss, policy, cloning, value]).detach()
         return torch.cat([losses, priorities])
 
-    def _step_actor(self, batch: Tensors, policy: Tensor, cloning: Tensor, score: Tensor) -> None:
-        """Step by both terms of eq. 23; where imitation has a batch, by an optimiser each."""
+    def _step_actor(
+        self, batch: Tensors, policy: Tensor, cloning: Tensor, pre_tanh: Tensor
+    ) -> None:
+        """Step by both terms of eq. 23, each with its optimiser if cloning has its own batch."""
         c, row = self.config, self.algorithm
-        saturation = c.saturation_weight * score.square().mean() if c.saturation_weight else 0.0
+        saturation = c.saturation_weight * pre_tanh.square().mean() if c.saturation_weight else 0.0
         if batch.shown is None:
             loss = policy + batch.cloning_weight * cloning + saturation
             _differentiate(loss, self.actor)
@@ -239,9 +241,9 @@ class TD3Learner:
         self.cloning_optimiser.step()
 
     def begin_actor_anew(self, batches: Iterable[Batch]) -> None:
-        """Put a fresh actor in place, fitted to batches of the human's actions.
+        """Replace the actor by a fresh one, fitted to batches of the human's actions.
 
-        To as many as there were updates, and at most ``MOST_BATCHES``.
+        It takes as many batches as there were updates, at most ``MOST_BATCHES``.
         """
         c, most = self.config, min(self.updates, MOST_BATCHES)
         with torch.random.fork_rng():
@@ -251,10 +253,10 @@ class TD3Learner:
         optimiser = torch.optim.Adam(fresh.parameters(), c.cloning_learning_rate, fused=True)
         for done, batch in enumerate(islice(batches, most)):
             optimiser.param_groups[0]["lr"] = c.cloning_learning_rate * (1 - done / most)
-            seen = self._shifted(tensors(batch.frames, self.device))
+            entries = self._shifted(tensors(batch.frames, self.device))
             human = self._tensor(batch.human)
             loss = equations.behaviour_cloning_loss(
-                fresh(*seen), self._tensor(batch.actions), human, None, c.cloning_bound
+                fresh(*entries), self._tensor(batch.actions), human, None, c.cloning_bound
             )
             _differentiate(loss, fresh)
             optimiser.step()
@@ -265,16 +267,16 @@ class TD3Learner:
         self.recorded.clear()
 
     def decay(self, progress: float) -> None:
-        """Decay both rates (table A5) and the weight on cloning after an episode.
+        """Decay the learning rates (table A5) and the cloning weight after an episode.
 
-        ``progress`` is the share of the run.
+        ``progress`` is the share of the run that is done.
         """
         c = self.config
         if c.cloning_share:
-            self._fade = max(0.0, 1.0 - progress / c.cloning_share)
+            self._cloning_fade = max(0.0, 1.0 - progress / c.cloning_share)
         left = 1.0 - (1.0 - c.learning_rate_final) * min(progress, 1.0)
         for name in OPTIMISERS:
-            fade = self._fade if name == "cloning_optimiser" else 1.0
+            fade = self._cloning_fade if name == "cloning_optimiser" else 1.0
             (group,) = getattr(self, name).param_groups
             group["decayed_lr"] *= c.learning_rate_decay
             rate = group["decayed_lr"] * left * fade
@@ -286,33 +288,33 @@ class TD3Learner:
     def state_dict(self) -> dict[str, Any]:
         """Return weights, optimisers, noise and counters: all that a resumed run needs."""
         parts = {name: getattr(self, name).state_dict() for name in (*NETWORKS, *OPTIMISERS)}
-        counted = {"updates": self.updates, "fade": self._fade}
+        counted = {"updates": self.updates, "fade": self._cloning_fade}
         return {**parts, "noise": self.noise.get_state(), **counted}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a ``state_dict``."""
         for name in (*NETWORKS, *OPTIMISERS):
-            # A copy, because optimisers keep the tensors that they are given.
+            # Copied, since optimisers keep the tensors that they load.
             getattr(self, name).load_state_dict(copy.deepcopy(state[name]))
-        for weights, kept in chain(*(getattr(self, name).state.items() for name in OPTIMISERS)):
-            if not kept["exp_avg"].shape == kept["exp_avg_sq"].shape == weights.shape:
+        for weights, moments in chain(*(getattr(self, name).state.items() for name in OPTIMISERS)):
+            if not moments["exp_avg"].shape == moments["exp_avg_sq"].shape == weights.shape:
                 # torch does not check.
-                raise ValueError("an optimiser's state is of other weights")
+                raise ValueError("an optimiser's state does not fit the weights")
         for group in chain(*(getattr(self, name).param_groups for name in OPTIMISERS)):
             group |= {"lr": self._rate(float(group["lr"])), "capturable": self._on_gpu}
         self.recorded.clear()
         self.noise.set_state(state["noise"])
-        self.updates, self._fade = state["updates"], state["fade"]
+        self.updates, self._cloning_fade = state["updates"], state["fade"]
 
     def _adam(self, network: torch.nn.Module, rate: float) -> torch.optim.Adam:
-        made = torch.optim.Adam(
+        optimiser = torch.optim.Adam(
             network.parameters(), self._rate(rate), fused=True, capturable=self._on_gpu
         )
-        made.param_groups[0]["decayed_lr"] = rate
-        return made
+        optimiser.param_groups[0]["decayed_lr"] = rate
+        return optimiser
 
     def _rate(self, rate: float) -> float | Tensor:
-        """Return a learning rate as Adam keeps it; a recorded step reads it from a tensor."""
+        """Return a learning rate in Adam's form; a recorded step must read it from a tensor."""
         return torch.tensor(rate, device=self.device) if self._on_gpu else rate
 
     @property
@@ -321,7 +323,7 @@ class TD3Learner:
 
     def _precision(self) -> torch.autocast:
         kind = self.device.type
-        reduced = self.config.precision == "bfloat16" and self._reduces
+        reduced = self.config.precision == "bfloat16" and self._only_pixels
         enabled = reduced and networks.bfloat16_is_faster(kind)
         # A recorded step must not begin with weights that were cast before it.
         return torch.autocast(kind, torch.bfloat16, enabled, cache_enabled=not self._on_gpu)
@@ -329,8 +331,8 @@ class TD3Learner:
     def _tensor(self, column: NDArray[Any]) -> Tensor:
         return torch.from_numpy(column).to(self.device)
 
-    def _shifted(self, seen: list[Tensor]) -> list[Tensor]:
-        return [self._shift(entry) for entry in seen]
+    def _shifted(self, entries: list[Tensor]) -> list[Tensor]:
+        return [self._shift(entry) for entry in entries]
 
     def _shift(self, entry: Tensor) -> Tensor:
         """Shift each picture [n, 2, 45, 80] at random by a few pixels, repeating its border.
@@ -361,16 +363,15 @@ class TD3Learner:
     def _targets(self, batch: Tensors) -> Tensor:
         c = self.config
         with self._precision():
-            own_picture = self.target_actor.picture(*batch.next_seen)
-            pictures = [critic.picture(*batch.next_seen) for critic in self.target_critics.pair]
+            own_picture = self.target_actor.picture(*batch.next_entries)
+            pictures = [critic.picture(*batch.next_entries) for critic in self.target_critics.pair]
         next_actions = torch.tanh(self.target_actor.head(own_picture))
         noise = c.target_noise * torch.randn(
             next_actions.shape, generator=self.noise, device=self.device
         )
         next_actions = equations.smoothed_target_action(next_actions, noise, c.target_noise_bound)
         first, second = _values(self.target_critics, pictures, next_actions)
-        values = first, second
-        return equations.td_target(batch.rewards, batch.terminals, values, batch.discount)
+        return equations.td_target(batch.rewards, batch.terminals, (first, second), batch.discount)
 
     def _critic_loss(
         self, batch: Tensors, pictures: list[Tensor], targets: Tensor
@@ -393,15 +394,15 @@ class TD3Learner:
             )
             loss = loss + first + second
             # The larger of the two actions' errors decides the row's priority.
-            missed = (c.intervention_penalty - overruled[0].detach()) * batch.penalised
-            errors = torch.where(missed.abs() > errors.abs(), missed, errors)
+            other = (c.intervention_penalty - overruled[0].detach()) * batch.penalised
+            errors = torch.where(other.abs() > errors.abs(), other, errors)
         if self.algorithm.proxy_values:
             for pair in zip(values, overruled, strict=True):
                 loss = loss + equations.proxy_value_loss(*pair, batch.human)
         return loss, errors, mean
 
     def _policy_loss(self, picture: Tensor, own_actions: Tensor, human: Tensor) -> Tensor:
-        """Return eq. 23's first term; without cloning it has all samples."""
+        """Return eq. 23's first term; without cloning over all samples, even if split."""
         if not self.algorithm.q_term:
             return torch.zeros((), device=self.device)
         values = self.critics.first.value(picture, own_actions)
@@ -416,40 +417,40 @@ class TD3Learner:
         if not row.behaviour_cloning:
             return torch.zeros((), device=self.device)
         if batch.shown is not None:
-            seen, actions = self._shifted(batch.shown.seen), batch.shown.actions
+            entries, actions = self._shifted(batch.shown.entries), batch.shown.actions
             human = torch.ones(len(actions), dtype=torch.bool, device=self.device)
             with self._precision():
-                picture = self.actor.picture(*seen)
+                picture = self.actor.picture(*entries)
             own_actions = torch.tanh(self.actor.head(picture))
             if row.weighted_cloning:
-                everyone = torch.arange(len(actions), device=self.device)
-                judged = self._judge(seen, actions, everyone, own_actions.detach())
+                all_rows = torch.arange(len(actions), device=self.device)
+                judged = self._judge(entries, actions, all_rows, own_actions.detach())
         weights = equations.cloning_weights(*judged) if row.weighted_cloning else None
         bound = self.config.cloning_bound
         return equations.behaviour_cloning_loss(own_actions, actions, human, weights, bound)
 
     def _preference_loss(self, foreseen: Choices) -> Tensor:
-        """Prefer the human's action in the states to which the overruled one would have led."""
-        seen = self._shifted(foreseen.seen)
+        """Return the loss that prefers the human's action in the predicted states."""
+        entries = self._shifted(foreseen.entries)
         with self._precision():
-            picture = self.actor.picture(*seen)
+            picture = self.actor.picture(*entries)
         actions = torch.tanh(self.actor.head(picture))
         beta = self.config.preference_beta
         return equations.preference_loss(actions, foreseen.actions, foreseen.overruled, beta)
 
     @torch.no_grad()
     def _judge(
-        self, seen: list[Tensor], actions: Tensor, looked_at: Tensor, own_actions: Tensor
+        self, entries: list[Tensor], actions: Tensor, rows: Tensor, own_actions: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return Q'(s, a) and Q'(s, pi(s)), [n] each, of the rows to look at; 0 of the others."""
+        """Return Q'(s, a) and Q'(s, pi(s)), [n] each, in ``rows``; 0 in the others."""
         row, values = self.algorithm, torch.zeros((2, len(actions)), device=self.device)
-        if (row.advantage_weight or row.weighted_cloning) and len(looked_at):
+        if (row.advantage_weight or row.weighted_cloning) and len(rows):
             critic = self.target_critics.first
-            # Copies picture by picture; [looked_at] copies byte by byte, 25 times as slow.
+            # index_select copies picture by picture; entry[rows] byte by byte, 25 times as slow.
             with self._precision():
-                picture = critic.picture(*(entry.index_select(0, looked_at) for entry in seen))
+                picture = critic.picture(*(entry.index_select(0, rows) for entry in entries))
             for value, chosen in zip(values, (actions, own_actions), strict=True):
-                value[looked_at] = critic.value(picture, chosen[looked_at])
+                value[rows] = critic.value(picture, chosen[rows])
         return values[0], values[1]
 
     def _priorities(self, errors: Tensor, judged: tuple[Tensor, Tensor], human: Tensor) -> Tensor:

@@ -178,7 +178,7 @@ def test_a_recorded_step_is_replayed_on_the_batch_of_each_call(monkeypatch):
 
     def step(batch):
         calls.append(batch)
-        return answer.copy_(batch.seen[0] + batch.actions)
+        return answer.copy_(batch.entries[0] + batch.actions)
 
     def begin_recording(*_, **__):
         graph.replay = lambda: step(calls[-1])

@@ -60,9 +60,9 @@ def load() -> ctypes.CDLL | None:
 
 
 def _built(source: Path) -> ctypes.CDLL:
-    """Load the library of this source, compiler and processor, built now if not in the cache."""
+    """Load the library for this source, compiler and processor; build it if it is not cached."""
     compiler = _compiler()
-    version = _ask([*compiler, "--version"]).stdout  # A newer one may know more of the processor.
+    version = _run([*compiler, "--version"]).stdout  # Newer ones use more of the processor.
     settings = *compiler, version, *_FLAGS, _OPENMP, _processor(), ""
     key = "\0".join(settings).encode() + source.read_bytes()
     library = _cache() / f"{source.stem}-{hashlib.sha256(key).hexdigest()[:16]}.so"
@@ -77,7 +77,7 @@ def _build(compiler: list[str], source: Path, library: Path) -> None:
     with tempfile.TemporaryDirectory(dir=library.parent, prefix="build-") as directory:
         target = Path(directory) / library.name
         for openmp in ([_OPENMP], []):
-            done = _ask([*compiler, *_FLAGS, *openmp, "-o", str(target), str(source)])
+            done = _run([*compiler, *_FLAGS, *openmp, "-o", str(target), str(source)])
             if done.returncode == 0:
                 write_atomic(library, target.read_bytes())
                 return
@@ -88,7 +88,7 @@ def _build(compiler: list[str], source: Path, library: Path) -> None:
     raise UserError(f"{compiler[0]} failed: {next(errors, f'status {done.returncode}')}")
 
 
-def _ask(command: list[str]) -> subprocess.CompletedProcess[str]:
+def _run(command: list[str]) -> subprocess.CompletedProcess[str]:
     try:
         return subprocess.run(
             command, capture_output=True, text=True, errors="replace",
@@ -108,7 +108,7 @@ def _compiler() -> list[str]:
 
 
 def _processor() -> str:
-    """Name the instruction set: several machines may share a home, and so the cache."""
+    """Describe the instruction set: several machines may share a home, and so the cache."""
     wanted = ("model name", "flags", "features", "cpu part")
     known = dict.fromkeys(line for line in cpu_info() if line.lower().startswith(wanted))
     return "\n".join([platform.machine(), platform.processor(), *known])
@@ -152,7 +152,7 @@ def trunk_features(
         kernel; from torch the parameters' type, or autocast's.
     """
     parameters = (conv1_weight, conv1_bias, conv2_weight, conv2_bias)
-    if not _served(frames, parameters):
+    if not _is_supported(frames, parameters):
         return _torch_features(frames, *parameters)
     if torch.is_grad_enabled() and any(parameter.requires_grad for parameter in parameters):
         return _Trunk.apply(frames, *parameters)
@@ -169,8 +169,8 @@ def _torch_features(
     return torch.flatten(hidden, 1)
 
 
-def _served(frames: Tensor, parameters: tuple[Tensor, ...]) -> bool:
-    """Whether the kernel can compute these features."""
+def _is_supported(frames: Tensor, parameters: tuple[Tensor, ...]) -> bool:
+    """Whether the compiled kernel can compute these features."""
     if torch.compiler.is_compiling() or torch.jit.is_tracing() or torch.onnx.is_in_onnx_export():
         return False
     shapes = (
@@ -179,17 +179,17 @@ def _served(frames: Tensor, parameters: tuple[Tensor, ...]) -> bool:
         (FILTERS[1], FILTERS[0], SIDE, SIDE),
         (FILTERS[1],),
     )
-    found = [(each.dtype, each.device.type, tuple(each.shape)) for each in parameters]
+    kinds = [(each.dtype, each.device.type, tuple(each.shape)) for each in parameters]
     return (
         (frames.dtype, frames.device.type) == (torch.uint8, "cpu")
         and frames.shape[1:] in ((1, *FRAME), (2, *FRAME))
-        and found == [(torch.float32, "cpu", shape) for shape in shapes]
+        and kinds == [(torch.float32, "cpu", shape) for shape in shapes]
         and load() is not None
     )
 
 
 def _in_place(frames: Tensor) -> Tensor:
-    """Copy the frames only if those of a picture do not lie one after the other."""
+    """Return the frames, copied only if a picture's frames are not contiguous."""
     rows, columns = FRAME
     return frames if frames.stride()[1:] == (rows * columns, columns, 1) else frames.contiguous()
 
@@ -210,13 +210,13 @@ def _forward(
     library = load()
     assert library is not None
     weight1, bias1, weight2, bias2 = parameters
-    # Named, so that copies live until the kernel is done.
+    # In variables, so that copies live until the kernel is done.
     kernels = _channels_innermost(weight1), _channels_innermost(weight2)
-    given = kernels[0], bias1.contiguous(), kernels[1], bias2.contiguous()
+    inputs = kernels[0], bias1.contiguous(), kernels[1], bias2.contiguous()
     features = torch.empty(frames.shape[0], FEATURES)
     library.trunk_forward(
         *_pictures(frames),
-        *(tensor.data_ptr() for tensor in given),
+        *(tensor.data_ptr() for tensor in inputs),
         features.data_ptr(),
         *(None if tensor is None else tensor.data_ptr() for tensor in saved),
         torch.is_autocast_enabled("cpu"),
@@ -247,7 +247,7 @@ class _Trunk(torch.autograd.Function):
         library = load()
         assert library is not None
         frames, weight2, *saved = ctx.saved_tensors
-        given = (_channels_innermost(weight2), *saved, gradients[0].contiguous())
+        inputs = (_channels_innermost(weight2), *saved, gradients[0].contiguous())
         results = (
             torch.empty(FILTERS[0], SIDE, SIDE, frames.shape[1]),
             torch.empty(FILTERS[0]),
@@ -256,7 +256,7 @@ class _Trunk(torch.autograd.Function):
         )
         library.trunk_backward(
             *_pictures(frames),
-            *(tensor.data_ptr() for tensor in (*given, *results)),
+            *(tensor.data_ptr() for tensor in (*inputs, *results)),
             ctx.reduced,
             torch.get_num_threads(),
         )
