@@ -1,4 +1,4 @@
-"""The command ``train``, and the same in Python: whether a run may begin or go on, and its end."""
+"""Run the command ``train``, or `train` in Python: check the options, train, print a summary."""
 
 import argparse
 import io
@@ -60,15 +60,15 @@ class Run:
     """A training run, usable as the path of its directory."""
 
     directory: Path
-    interrupted: bool = False  # Whether it was asked to end before its time; ``resume`` goes on
-    scenario: str | None = None  # As ``train`` was told: so it may be of a module
+    interrupted: bool = False  # Stopped before its configured end; ``resume`` continues it
+    scenario: str | None = None  # As given to ``train``: it may be ``module:ID``
 
     def __fspath__(self) -> str:
         return str(self.directory)
 
     @property
     def metrics(self) -> pd.DataFrame:
-        """The numbers of ``metrics.csv`` and the outcome, a training episode a row."""
+        """The table of ``metrics.csv``, one row per training episode."""
         return metrics_table(self.directory)
 
 
@@ -84,8 +84,8 @@ def _run_seeds(arguments: argparse.Namespace) -> Iterator[bool]:
     jobs = []
     for seed in arguments.seeds:
         out = Path(arguments.out) / f"seed_{seed}"
-        begun = arguments.resume and (out / CONFIG_FILE).is_file()
-        own = {"seed": seed, "out": str(out), "resume": begun}
+        resume = arguments.resume and (out / CONFIG_FILE).is_file()
+        own = {"seed": seed, "out": str(out), "resume": resume}
         jobs.append(argparse.Namespace(**{"threads": 1, **vars(arguments), **own}))
     pool = ProcessPoolExecutor(
         util.cores(), get_context("spawn"), util.begin_process, (0,), max_tasks_per_child=1
@@ -102,29 +102,29 @@ def _run_seeds(arguments: argparse.Namespace) -> Iterator[bool]:
 
         with quit_on_signals(quit_all):
             for each in as_completed(work):
-                said, interrupted = ("", True) if each.cancelled() else each.result()
+                printed, interrupted = ("", True) if each.cancelled() else each.result()
                 bar.advance({})
-                print(said, end="")
+                print(printed, end="")
                 yield interrupted
 
 
 def _run_quietly(arguments: argparse.Namespace) -> tuple[str, bool]:
     """Return what a run prints at its end, and whether it was interrupted."""
-    with redirect_stdout(io.StringIO()) as said, redirect_stderr(io.StringIO()):
+    with redirect_stdout(io.StringIO()) as printed, redirect_stderr(io.StringIO()):
         interrupted = _run(arguments).interrupted
-    return said.getvalue(), interrupted
+    return printed.getvalue(), interrupted
 
 
 def _run(arguments: argparse.Namespace) -> Run:
-    given = {name: value for name, value in vars(arguments).items() if name in TYPED}
-    own = Path(arguments.out) / CONFIG_FILE
-    in_file: dict[str, Any] = {}
-    if arguments.resume and own.is_file():
-        in_file = settings_in(read_json(own, "run config"), str(own))
-        for name in {"scenario", "algorithm", "human", "success"} - given.keys():
-            # A name of a module must be typed: no file imports one.
-            name_in_file(str(in_file.get(name)), f"{arguments.out} was trained with", f"--{name}")
-    values = {**in_file, **given, **dict(map(parse_setting, arguments.set))}
+    typed = {name: value for name, value in vars(arguments).items() if name in TYPED}
+    path = Path(arguments.out) / CONFIG_FILE
+    saved: dict[str, Any] = {}
+    if arguments.resume and path.is_file():
+        saved = settings_in(read_json(path, "run config"), str(path))
+        for name in {"scenario", "algorithm", "human", "success"} - typed.keys():
+            # A module's name must be typed: none is imported because a file names it.
+            name_in_file(str(saved.get(name)), f"{arguments.out} was trained with", f"--{name}")
+    values = {**saved, **typed, **dict(map(parse_setting, arguments.set))}
     return _begin(values.pop("preset", "ours"), values, arguments)
 
 
@@ -153,10 +153,10 @@ def train(
 ) -> Run:
     """Train a policy with human guidance, as ``python -m trainer train`` does.
 
-    The arguments are that command's options, ``out`` a new directory in ``runs`` by default, and
-    ``settings`` what ``--set`` changes, name to value. ``on_step(transition, intervention, info)``
-    is called after each control period. Returns the run, for ``evaluate`` and ``export``. Raises
-    UserError: no such environment, algorithm, human or setting, or a directory that is taken.
+    The arguments are that command's options; ``out`` defaults to a new directory in ``runs``, and
+    ``settings`` maps names of ``--set`` to values. ``on_step(transition, intervention, info)`` is
+    called after each control period. Returns the run, for ``evaluate`` and ``export``. Raises
+    UserError: no such environment, algorithm, human or setting, or a directory in use.
     """
     options_given = dict(locals())
     if isinstance(settings, Mapping):
@@ -171,7 +171,7 @@ def _begin(preset: str, values: dict[str, Any], how: argparse.Namespace) -> Run:
     if not SLOWEST <= how.speed <= FASTEST:
         raise UserError(f"speed must be from {SLOWEST} to {FASTEST}: {how.speed}")
     human = values.get("human", DEFAULTS.human)
-    # A run's own config says ``person``.
+    # The config of a run that a person guides says ``person``.
     values["human"] = PERSON if human in (*HUMANS, PERSON) else located(human)
     demonstrations = values.get("demonstrations")
     if demonstrations and not SCRIPTED.fullmatch(demonstrations):
@@ -201,8 +201,8 @@ def _train(config: RunConfig, run_dir: Path, env: Any, how: argparse.Namespace) 
         if config.human == PERSON:
             from trainer.person.run import training_with_person
 
-            began = training_with_person(how, config, run_dir, env, resume)
-            training, quit_training = stack.enter_context(began)
+            opened = training_with_person(how, config, run_dir, env, resume)
+            training, quit_training = stack.enter_context(opened)
         else:
             training = TrainingRun(config, run_dir, resume, env)
             quit_training = partial(_quit, training)
@@ -245,8 +245,8 @@ def _train(config: RunConfig, run_dir: Path, env: Any, how: argparse.Namespace) 
 
 
 def _quit(training: TrainingRun) -> bool:
-    # Not print: a signal may come in the midst of one, which takes no other. And the reader, such
-    # as `tee`, may have had the same ^C.
+    # Not print, which fails inside another print that the signal interrupts. OSError: the reader,
+    # such as `tee`, may have ended by the same ^C.
     with suppress(OSError):
         os.write(2, b"ending after this episode; a second time: at once, back to the checkpoint\n")
     training.quitting = True
@@ -258,14 +258,14 @@ def _summary(rows: pd.DataFrame, config: RunConfig) -> str:
         return "no episodes"
     last, confirmed = rows.iloc[-1], rows.confirmed_success.max()
     amounts = {"episode": len(rows), "step": last.total_steps, "update": last.updates}
-    said = [counted(count, name) for name, count in amounts.items()]
-    said.append(f"{counted(last.total_takeovers, 'take-over')} with {last.total_human_s:.0f} s")
-    said.append(counted(last.total_failures, "failure"))
-    if confirmed == confirmed:  # Of the kept actor
+    parts = [counted(count, name) for name, count in amounts.items()]
+    parts.append(f"{counted(last.total_takeovers, 'take-over')} with {last.total_human_s:.0f} s")
+    parts.append(counted(last.total_failures, "failure"))
+    if confirmed == confirmed:  # Not NaN: an actor was kept
         count = config.confirmation_factor * config.evaluation_runs
         share = success_estimate(round(confirmed * count), count).as_share()
-        said.append(f"kept actor {share} %")
-    return ", ".join(said)
+        parts.append(f"kept actor {share} %")
+    return ", ".join(parts)
 
 
 def check_directory(run_dir: Path, config: RunConfig, resume: bool) -> bool:
@@ -277,7 +277,7 @@ def check_directory(run_dir: Path, config: RunConfig, resume: bool) -> bool:
     if started and not resume:
         raise UserError(f"{run_dir} holds a run; add --resume, or choose another --out")
     if resume and not started:
-        # It may have been killed before the first one.
+        # It may have been killed before its first checkpoint.
         begun = (run_dir / CONFIG_FILE).is_file()
         if not begun or len(read_metrics(run_dir)) > config.checkpoint_every:
             raise UserError(f"{run_dir} holds no checkpoint to resume from")
@@ -292,7 +292,7 @@ def _check_settings(run_dir: Path, config: RunConfig) -> None:
     saved, wanted = settings_in(read_json(path, "run config"), str(path)), flat(config)
     for name, now in wanted.items():
         before = saved.get(name)
-        # A run may go on for longer.
+        # A run may be extended, but not shortened.
         if before is None or (now < before if name in EXTENT else now != before):
-            what = f"{run_dir} was trained with {name} = {before}, not {now}"
-            raise UserError(f"{what}: repeat the options that it had")
+            difference = f"{run_dir} was trained with {name} = {before}, not {now}"
+            raise UserError(f"{difference}: repeat the options that it had")

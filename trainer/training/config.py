@@ -1,4 +1,4 @@
-"""A training run's settings: all that decides its result, from options, files and presets."""
+"""The settings that decide a training run's result, from options, files and presets."""
 
 import difflib
 import math
@@ -13,7 +13,7 @@ from trainer.learner.config import PRINTED_LEARNER, LearnerConfig, find_algorith
 from trainer.util import FROM_ONE, SHARE, check_ranges
 
 MOST_THREADS = 1024
-"""More than a machine could use. Torch dies where the system has fewer than it asks for."""
+"""More than any machine can use. Torch crashes if the system cannot start the threads."""
 RANGES = {
     FROM_ONE: ("episodes", "evaluation_runs", "checkpoint_every"),
     SHARE: ("guided_share", "poor_guidance_share", "missed_share"),
@@ -21,31 +21,31 @@ RANGES = {
     (0, MOST_THREADS): ("threads",),
     (MIN_PERIOD_S, MAX_PERIOD_S): ("period_s",),
 }
-"""What these numbers may be; all others are at least 0."""
+"""Ranges of these numbers; all others are at least 0."""
 CURVE_FILE = "learning_curve.png"
-EXTENT = ("episodes", "steps")  # How long a run is: it may go on for longer
+EXTENT = ("episodes", "steps")  # Length of a run; a resumed run may raise it
 OPTIONS = (
     "scenario", "algorithm", "seed", "human", "latency", "device", "threads", "demonstrations",
     "success",
 )  # fmt: skip
-"""What an option of its own decides; all else is changed by ``--set``."""
+"""Settings with an option of their own; ``--set`` changes all others."""
 TYPED = (*OPTIONS, *EXTENT, "preset")
 CONFIG_FILE = "config.json"  # A run's settings in its directory, with the source's revision
 RANDOM, BIASED, TAKEOVERS = GUIDANCE = ("random", "biased", "takeovers")
-"""How a human of poor guidance is wrong: each time another way, always the same, or the same in
-whole take-overs."""
+"""A poor human's wrong actions: drawn each time, always the same, or the same for whole
+take-overs."""
 
 
 @dataclass(frozen=True)
 class RunConfig:
-    """A run's settings; the same ones on the same machine, with the compiled kernel or without it,
-    give the same weights.
+    """Settings of a run. The same settings on the same machine give the same weights, as long as
+    the compiled kernel is used in both runs or in neither.
     """
 
     scenario: str = "left_turn"
     algorithm: str = "phil_td3"
     """Learning algorithm: phil_td3, ia_td3, hi_td3, rd2_td3, rd2_phil, per_td3, another row of
-    trainer/README.md, one of an installed package, or ``MODULE:ROW``."""
+    trainer/learner/config.py, one of an installed package, or ``MODULE:ROW``."""
     seed: int = 0
     episodes: int = 400
     """Maximum number of training episodes (table A5: 400)."""
@@ -68,13 +68,13 @@ class RunConfig:
     """Share of the reasons to take over that the human overlooks, each for 15 control periods."""
     averaged_actor: bool = True
     """Whether the target actor is validated, kept and exported, instead of the actor that learns.
-    It is a running average of that one (Polyak and Juditsky, 1992), which swings."""
+    The learning actor oscillates; the target is its running average (Polyak and Juditsky, 1992)."""
     poor_guidance_share: float = 0.0
     """Share of the human's actions, or take-overs, replaced by wrong ones (section VII-E: one
     third)."""
     poor_guidance: str = RANDOM
-    """The wrong actions: ``random`` (the paper's), ``biased``, always the same one, or
-    ``takeovers``, that one from a take-over's beginning to its end."""
+    """The wrong actions: ``random`` (the paper's), ``biased`` (always the same one), or
+    ``takeovers`` (that one through whole take-overs)."""
     period_s: float = 0.0
     """Control period, s; 0: the environment's own."""
     printed_reward: bool = False
@@ -85,12 +85,12 @@ class RunConfig:
     evaluation_runs: int = 30
     """Episodes of a validation."""
     confirmation_factor: int = 2
-    """Times as many episodes as a validation has, other ones, an actor drives before it is kept; 0:
-    none. The best of many validations overestimates its actor."""
+    """An actor is kept only after driving this many times a validation's episodes, on other seeds;
+    0: at once. The best of many validations overestimates its actor."""
     checkpoint_every: int = 10
     """Episodes between two checkpoints."""
     latency: str = "none"
-    """The network between policy and vehicle, in training and validation alike, in the words of
+    """Simulated network between policy and vehicle, in training and validation, written as for
     ``bridge simulate --latency``."""
     device: str = "cpu"
     threads: int = 0
@@ -101,8 +101,8 @@ class RunConfig:
     a LeRobot data set, or ``human:N``, N drives of the scripted human. Their seconds count as the
     human's."""
     success: str = ""
-    """Who says whether an episode succeeded, where the environment does not: it takes the last
-    observation, its info and the return, and returns True, False or None."""
+    """Function that decides whether an episode succeeded, where the environment does not. It takes
+    the last observation, its info and the return; it returns True, False or None."""
     learner: LearnerConfig = field(default_factory=LearnerConfig)
 
     def __post_init__(self) -> None:
@@ -125,19 +125,19 @@ class RunConfig:
         return "target_actor" if self.averaged_actor else "actor"
 
     def label(self, episode: int) -> dict[str, Any]:
-        """Return what a file of the run says of its run and episode."""
+        """Return the fields with which a file of the run names run and episode."""
         names = ("scenario", "algorithm", "seed")
         return {**{name: getattr(self, name) for name in names}, "episode": episode}
 
 
 PRINTED = RunConfig(averaged_actor=False, printed_reward=True, learner=PRINTED_LEARNER)
-"""As the paper prints it; but a human who frees a stuck car is no penalty (eq. 17), and eq. 21b's
-exponent has a bound. Where the paper can be read in two ways, table A5's noise scale of 0.2 is that
-of TD3's target smoothing, which eq. 22 does not show, its rates of 1 and 0.05 are deviations of the
-exploration noise (eq. 18b), and eq. 32 counts steering in units of full action. What it leaves open
-is ours: cloning weight, precision, 256 steps before the first update, the best actor kept."""
+"""The paper's printed settings, except that freeing a stuck car is not penalised (eq. 17), and eq.
+21b's exponent has a bound. Where the paper is ambiguous: table A5's noise scale of 0.2 is that of
+TD3's target smoothing, which eq. 22 does not show; its rates of 1 and 0.05 are deviations of the
+exploration noise (eq. 18b); eq. 32 counts steering in units of full action. Where it says nothing,
+ours apply: cloning weight, precision, 256 steps before the first update, the best actor kept."""
 PRESETS = {"ours": RunConfig(), "printed": PRINTED}
-"""Where the settings of a training start from, by the word behind ``--preset``."""
+"""Settings to start from, by the word behind ``--preset``."""
 DEFAULTS = RunConfig()
 SETTINGS: dict[str, Any] = {
     **{n: v for n, v in asdict(DEFAULTS).items() if n not in (*OPTIONS, *EXTENT, "learner")},
@@ -148,8 +148,8 @@ EXPECTED = {bool: "true or false", int: "a whole number", float: "a number"}
 
 
 def make_config(preset: str, values: Mapping[str, Any], env: Any = None) -> RunConfig:
-    """Make a config of a preset, what the environment asks for, the algorithm's own settings, and
-    ``values`` over all, by name.
+    """Make a config: a preset, changed by the environment's defaults, by the algorithm's own
+    settings, and last by ``values``, name to value.
 
     Raises UserError: no such preset or algorithm, or a value out of range.
     """
@@ -158,17 +158,17 @@ def make_config(preset: str, values: Mapping[str, Any], env: Any = None) -> RunC
     start, values = PRESETS[preset], dict(values)
     values["latency"] = str(parse_spec(values.get("latency", start.latency)))
     algorithm = values.get("algorithm", start.algorithm)
-    row, asked = find_algorithm(algorithm), {}
+    row, of_task = find_algorithm(algorithm), {}
     if env is not None and preset == "ours":
         from trainer.learner.networks import sees_picture  # torch takes two seconds to load
 
-        asked = task_settings(row, not sees_picture(env.observation_space), env.control_period_s)
+        of_task = task_settings(row, not sees_picture(env.observation_space), env.control_period_s)
     try:
-        learner = replace(start.learner, **{**asked, **row.settings})
+        learner = replace(start.learner, **{**of_task, **row.settings})
     except TypeError as error:  # The row is a plug-in's.
         raise UserError(f"settings of {algorithm}: {error}") from None
     own = {name: values.pop(name) for name in tuple(values) if hasattr(learner, name)}
-    # All at once: some hold only together.
+    # At once: some values are valid only together.
     return replace(start, **values, learner=replace(learner, **own))
 
 
@@ -177,8 +177,8 @@ def parse_setting(assignment: str) -> tuple[str, Any]:
 
     Raises UserError: no such setting, or no such value of it.
     """
-    name, given, text = assignment.partition("=")
-    if not given:
+    name, equals, text = assignment.partition("=")
+    if not equals:
         raise UserError(f"--set {assignment}: expected NAME=VALUE")
     if name not in SETTINGS:
         near = difflib.get_close_matches(name, SETTINGS, 1)
@@ -199,26 +199,26 @@ def flat(config: RunConfig) -> dict[str, Any]:
 
 
 def settings_in(values: Mapping[str, Any], place: str) -> dict[str, Any]:
-    """Return the settings that a file holds, by their names, those of the learner among them.
+    """Return the settings in a file by name, those of the learner among them.
 
-    Former settings are left out. UserError where a value is of another type.
+    Settings that no longer exist are left out. UserError for a value of the wrong type.
     """
     learner = values.get("learner", {})
     if not isinstance(learner, dict):
         raise UserError(f"config {place}: learner cannot be {learner!r}")
-    found: dict[str, Any] = {}
+    settings: dict[str, Any] = {}
     for name, value in {**values, **learner}.items():
         if name in SETTINGS:
-            found[name] = parse_setting(f"{name}={value}")[1]
+            settings[name] = parse_setting(f"{name}={value}")[1]
         elif name in (*OPTIONS, *EXTENT):
             if type(value) is not type(getattr(DEFAULTS, name)):
                 raise UserError(f"config {place}: {name} cannot be {value!r}")
-            found[name] = value
-    return found
+            settings[name] = value
+    return settings
 
 
 def period_of(config: Mapping[str, Any]) -> float | None:
-    """Return the control period of a saved run, s; None where the environment said it."""
+    """Return the control period of a saved run, s; None for the environment's own."""
     period_s = config.get("period_s", 0.0)
     if not isinstance(period_s, int | float):
         raise UserError(f"period_s of the run's config is no number: {period_s!r}")

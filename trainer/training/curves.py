@@ -40,13 +40,13 @@ def run(arguments: argparse.Namespace) -> int:
 def write_learning_curve(*dirs: Path, out: str | None = None, x: str = "steps") -> Path:
     """Draw return, surviving distance, validation and the human's share as a PNG.
 
-    Runs of one algorithm are one line, their mean, in its 95 % interval, as far as all of them go.
-    A directory may be a run, or hold runs. Where nothing tells whether an episode succeeded,
-    validation's return is drawn. ``out`` is by default in the first directory. UserError: a run has
-    no metrics yet.
+    Runs of one algorithm become one line, their mean with its 95 % interval, up to the end of the
+    shortest. A directory is a run, or holds runs. If success is unknown, the validation's return is
+    drawn instead. ``out`` defaults to a file in the first directory. UserError: a run has no
+    metrics yet.
     """
     groups: dict[str, list[pd.DataFrame]] = {}
-    for run_dir in (found for each in dirs for found in _runs_in(each)):
+    for run_dir in (run_dir for directory in dirs for run_dir in _runs_in(directory)):
         groups.setdefault(_name(run_dir), []).append(_curves(run_dir))
     runs = [run for group in groups.values() for run in group]
     left_out = RETURN if any(run[SUCCESS].notna().any() for run in runs) else SUCCESS
@@ -76,11 +76,11 @@ def _name(run_dir: Path) -> str:
 
 
 def _curves(run_dir: Path) -> pd.DataFrame:
-    """Return a run's metrics as numbers, an episode a row; validation's are smoothed by nothing."""
+    """Return a run's metrics as numbers, an episode a row, smoothed except for validation."""
     curves = metrics_table(run_dir).drop(columns="outcome").astype(float)
     if curves.empty:
         raise UserError(f"{run_dir} holds no metrics to draw")
-    # Demonstrations before the first episode count in it.
+    # The first episode also counts the demonstrations before it.
     curves["human_share"] = (curves.human_steps / curves.steps).clip(upper=1.0)
     smooth = [name for name in PANELS if name not in (SUCCESS, RETURN)]
     curves[smooth] = curves[smooth].rolling(WINDOW, min_periods=1).mean()

@@ -1,9 +1,9 @@
 """``train --demonstrations``: drives that fill the replay before the first step.
 
-A person's sittings hold transitions. Of a recording of the wire the actions are driven again, in
-the run's environment; one of `bridge sense` is taken as it is, for nobody can drive it again. A
-LeRobot data set holds observations and actions; its pictures are one a frame, and a stack is made
-of the frames before. ``human:N`` stands for N drives of a scripted human.
+A person's sittings hold whole transitions. A recording of the wire holds actions, which are driven
+again in the run's environment; one of `bridge sense` is used as it is, since it cannot be driven
+again. A LeRobot data set holds observations and actions, with one picture per frame; a stack is
+rebuilt from earlier frames. ``human:N`` stands for N drives of a scripted human.
 """
 
 import re
@@ -33,7 +33,7 @@ from trainer.util import Purpose, episode_seed
 Episode = list[Transition]
 REWARD = "next.reward"  # Column of a data set; ours have none
 SCRIPTED = re.compile(r"human:(\d+)")
-"""In a path's place: so many drives of the run's own human, a script or a model."""
+"""Instead of a path: N drives of the run's own human, a script or a model."""
 
 
 def read_demonstrations(place: Path, env: Any) -> Iterator[Episode]:
@@ -56,13 +56,13 @@ def read_demonstrations(place: Path, env: Any) -> Iterator[Episode]:
 
 
 def drive_demonstrations(driver: Driver, env: Any, seed: int, episodes: int) -> Iterator[Episode]:
-    """Yield episodes of a run of this seed that the driver drives alone."""
+    """Yield episodes that the driver drives alone, with seeds derived from the run's ``seed``."""
     for number in range(episodes):
         drive, episode = Drive(env, episode_seed(seed, Purpose.DEMONSTRATIONS, number)), Episode()
         driver.reset()
         while not drive.over:
             drive.step(driver.act(drive.observation))
-            episode.append(replace(drive.seen, overruled=None, human=True))
+            episode.append(replace(drive.transition, overruled=None, human=True))
         yield episode
 
 
@@ -73,22 +73,22 @@ def _from_sitting(steps: list[RecordedStep], env: Any) -> Episode:
 
 
 def _driven_again(drive: fork.RecordedEpisode, env: Any) -> Episode:
-    """Take the recorded actions from the recorded seed; what comes of them is what is learned."""
-    about, wanted = (drive.task.text, drive.origin.condition), (task_of(env).text, NOMINAL)
-    if about != wanted:
-        raise UserError(f"{drive.path} is of {' in the scene '.join(about)}, not of {wanted[0]}")
+    """Drive the recorded actions again from the recorded seed; return the new transitions."""
+    recorded, wanted = (drive.task.text, drive.origin.condition), (task_of(env).text, NOMINAL)
+    if recorded != wanted:
+        raise UserError(f"{drive.path} is of {' in the scene '.join(recorded)}, not of {wanted[0]}")
     options = {"standing": True} if drive.origin.standing else None
     observation, _ = env.reset(seed=drive.origin.seed, options=options)
     press_brake, episode = getattr(env, "press_brake", lambda pressed: None), Episode()
     for step in range(drive.steps):
-        own, braked = drive.applied[step]
+        applied, braked = drive.applied[step]
         press_brake(braked)
-        action = inner(env.action_range, own)
-        seen, reward, terminated, truncated, _ = env.step(action)
+        action = inner(env.action_range, applied)
+        following, reward, terminated, truncated, _ = env.step(action)
         episode.append(
-            Transition(observation, action, reward, seen, terminated, truncated, human=True)
+            Transition(observation, action, reward, following, terminated, truncated, human=True)
         )
-        observation = seen
+        observation = following
         if terminated or truncated:
             break
     press_brake(False)
@@ -96,45 +96,45 @@ def _driven_again(drive: fork.RecordedEpisode, env: Any) -> Episode:
 
 
 def _as_recorded(path: Path, env: Any) -> Iterator[Episode]:
-    """Take what was seen, and what the vehicle did in each period, without a reward.
+    """Yield the recorded observations with the vehicle's reported actions, without rewards.
 
-    Where the runtime did not drive, a person did, by the vehicle's own remote control. How long it
-    stood before and after shows nothing. Raises UserError where it never moved.
+    Where the runtime did not drive, a person did, by the vehicle's own remote control. Standstill
+    before and after a drive is cut off. Raises UserError if the vehicle never moved.
     """
-    recording, task, told = Recording(path), task_of(env), None
+    recording, task, feedback = Recording(path), task_of(env), None
     layout, drives = Layout(task), dict[tuple[str, int], list[tuple[State, Feedback | None]]]()
     for _, message in valid_messages(recording, choose_vehicle(recording, None)):
         if isinstance(message, Feedback):
-            told = message
+            feedback = message
         elif isinstance(message, State):
             if message.task != task.text or layout.refusal(message.observation):
                 raise UserError(f"{path} is of {message.task}, not of {task.text}")
-            drives.setdefault((message.session, message.episode), []).append((message, told))
+            drives.setdefault((message.session, message.episode), []).append((message, feedback))
     recording.say_trouble()
-    found = False
+    ever_moved = False
     for drive in drives.values():
         steps = [
-            (state, after, did) for (state, _), (after, did) in pairwise(drive)
-            if did is not None and after.step == state.step + 1
+            (state, after, report) for (state, _), (after, report) in pairwise(drive)
+            if report is not None and after.step == state.step + 1
         ]  # fmt: skip
-        moves = [n for n, (*_, did) in enumerate(steps) if abs(did.speed_mps) > STANDSTILL_MPS]
-        if not moves:
+        rows = [n for n, (*_, report) in enumerate(steps) if abs(report.speed_mps) > STANDSTILL_MPS]
+        if not rows:
             continue
-        found, steps = True, steps[moves[0] : moves[-1] + 1]
+        ever_moved, steps = True, steps[rows[0] : rows[-1] + 1]
         yield [
-            Transition(_seen(state, layout, env), inner(env.action_range, did.action), 0.0,
-                       _seen(after, layout, env), False, number == len(steps), did.mode != DRIVE)
-            for number, (state, after, did) in enumerate(steps, 1)
+            Transition(_array(state, layout, env), inner(env.action_range, report.action), 0.0,
+                       _array(after, layout, env), False, n == len(steps), report.mode != DRIVE)
+            for n, (state, after, report) in enumerate(steps, 1)
         ]  # fmt: skip
-    if not found:
+    if not ever_moved:
         raise UserError(f"{path} shows no drive: the vehicle never moved, or nobody recorded it")
 
 
-def _seen(state: State, layout: Layout, env: Any) -> NDArray[Any]:
-    seen = np.zeros(env.layout.shape, env.layout.dtype)
+def _array(state: State, layout: Layout, env: Any) -> NDArray[Any]:
+    observation = np.zeros(env.layout.shape, env.layout.dtype)
     for name, array in layout.arrays(state.observation).items():
-        (seen[name] if seen.dtype.names else seen)[...] = array
-    return seen
+        (observation[name] if observation.dtype.names else observation)[...] = array
+    return observation
 
 
 def _from_dataset(folder: Path, env: Any) -> Iterator[Episode]:
@@ -154,9 +154,9 @@ def _from_dataset(folder: Path, env: Any) -> Iterator[Episode]:
     table = read_table(folder / "data").to_pydict()
     if missing := {"action", "episode_index", *keys.values()} - table.keys():
         raise UserError(f"{folder} lacks the features {', '.join(sorted(missing))}")
-    seen = np.zeros((len(table["action"]), *env.layout.shape), env.layout.dtype)
+    observations = np.zeros((len(table["action"]), *env.layout.shape), env.layout.dtype)
     for name, entry in entries.items():
-        column = seen[name] if seen.dtype.names else seen
+        column = observations[name] if observations.dtype.names else observations
         if name in keys:
             column[...] = np.reshape(table[keys[name]], column.shape)
             continue
@@ -165,13 +165,13 @@ def _from_dataset(folder: Path, env: Any) -> Iterator[Episode]:
         frames = [f.to_ndarray(format=colours) for v in videos for f in av.open(str(v)).decode()]
         column[...] = _stacked(np.array(frames), column.shape, table["episode_index"])
     actions = [inner(env.action_range, action) for action in table["action"]]
-    rewards = table.get(REWARD, np.zeros(len(seen)))
-    done = table.get("next.done", np.zeros(len(seen), bool))
-    for _, group in groupby(range(len(seen)), key=lambda row: table["episode_index"][row]):
+    rewards = table.get(REWARD, np.zeros(len(actions)))
+    done = table.get("next.done", np.zeros(len(actions), bool))
+    for _, group in groupby(range(len(actions)), key=lambda row: table["episode_index"][row]):
         rows = list(group)
         yield [
-            Transition(seen[row], actions[row], float(rewards[row]), seen[after], False,
-                       bool(done[row]), human=True)
+            Transition(observations[row], actions[row], float(rewards[row]), observations[after],
+                       False, bool(done[row]), human=True)
             for row, after in pairwise(rows)
         ]  # fmt: skip
 
@@ -179,7 +179,7 @@ def _from_dataset(folder: Path, env: Any) -> Iterator[Episode]:
 def _stacked(
     frames: NDArray[np.uint8], shape: tuple[int, ...], episodes: list[int]
 ) -> NDArray[np.uint8]:
-    """Return pictures of ``shape``, [n, ...]; a stack holds the newest last."""
+    """Return pictures of ``shape``, [n, ...], stacked within an episode with the newest last."""
     if frames.ndim == len(shape):
         return frames
     row, begins = np.arange(len(frames)), np.searchsorted(episodes, episodes)

@@ -1,8 +1,8 @@
-"""Replay and learner beside the environment: one update while one step is driven.
+"""Replay and learner in a thread beside the environment: one update during each step.
 
 The order is fixed, so that a run depends on its seed alone: in each control period the policy acts,
-an update on what was stored before is begun, the environment takes its step, the update is
-finished, and only then the step is stored. Beside a person nothing waits (`UnhurriedLearning`).
+an update on the stored steps starts, the environment takes its step, the update finishes, and only
+then the new step is stored. Beside a person the loop never waits (`UnhurriedLearning`).
 """
 
 import copy
@@ -31,12 +31,12 @@ from trainer.scenarios import SCENARIOS
 from trainer.training.config import RunConfig
 from trainer.util import Purpose, random_stream
 
-LOSSES = Losses._fields[:4]  # What is averaged over an episode
-MOST_TO_FIT = 4096  # Observations by whose spread numbers are scaled
+LOSSES = Losses._fields[:4]  # Averaged over an episode
+MOST_TO_FIT = 4096  # Observations to which the scales of numbers are fitted
 USUAL_RETURN, USUAL_FACTOR = 10.0, 3.0
-"""Returns of about +-10 stay as they are: within that factor."""
+"""Returns within this factor of 10 are not rescaled."""
 FRESH_BATCH_SIZE = 256
-NICENESS = 10  # Of what learns beside a person, with torch's own threads: the loop goes first
+NICENESS = 10  # Of the learner's threads beside a person: the loop goes first
 
 
 def diverged(what: str) -> UserError:
@@ -48,9 +48,9 @@ class LearningThread:
     """A learner with its replay buffer; the updates run in a thread of their own.
 
     The policy acts in that thread, too: another would bring a second pool of OpenMP threads, and
-    the two would fight for the same cores. The networks are on the config's device. Replay, and the
-    copy of the actor that acts, are in the processor's memory: it answers one observation sooner
-    than a GPU.
+    the two would fight for the same cores. The networks are on the config's device. The replay and
+    the copy of the actor that acts are on the CPU, which answers a single observation sooner than a
+    GPU.
     """
 
     def __init__(self, config: RunConfig, env: Any) -> None:
@@ -70,45 +70,45 @@ class LearningThread:
             raise UserError(f"replay_capacity {c.replay_capacity}: {error}") from None
         self._random = random_stream(config.seed, Purpose.REPLAY)
         late = ticks_late(parse_spec(config.latency), env.control_period_s)
-        self._seen: deque[Observation] = deque(maxlen=late + 1)
-        """What the policy knows, and what it does not know yet, behind the network."""
-        # Adam's mean of a gradient that has ended stays denormal for ever, and a processor takes
-        # many times as long for those: 3 ms a step instead of 1. To a weight they add nothing.
-        # First of all in this thread, so that the kernel's OpenMP threads inherit it.
+        self._observations: deque[Observation] = deque(maxlen=late + 1)
+        """The newest observations; behind the network the policy knows only the oldest of them."""
+        # Adam's mean of a gradient that has become 0 stays denormal for ever. Denormal numbers add
+        # nothing to a weight, but cost many times as long: 3 ms a step instead of 1. Flushed first
+        # of all in this thread, so that the kernel's OpenMP threads inherit it.
         self._thread = ThreadPoolExecutor(1, "learner", torch.set_flush_denormal, (True,))
         self._acting = copy.deepcopy(self.learner.actor).cpu()
         self._begun: Future[tuple[list[Batch], list[Losses], float]] | None = None
         self._scenario = config.scenario
         self._fitted, self._renewed = False, 0
-        """Whether observations and rewards are scaled by what the warm-up has seen."""
+        """Whether the scales are fitted to the warm-up; number of fresh actors so far."""
         self._forget_losses()
 
     def act(self, observation: Observation) -> Action:
         return self.in_thread(self._acting.act, observation[None])[0]
 
     def doubt(self, observation: Observation, action: Action) -> float:
-        """Return how much the critics differ about an action; not while updating."""
+        """Return the critics' disagreement about an action; call it while no update runs."""
         return self.in_thread(self.learner.doubt, observation, action)
 
     def in_thread(self, work: Callable[..., Any], *arguments: Any) -> Any:
         return self._thread.submit(work, *arguments).result()
 
     def add(self, transition: Transition) -> None:
-        """Store what happened at the vehicle as the policy learns of it: late, and shaped.
+        """Store a transition, its reward shaped, its observations as late as the policy gets them.
 
-        Behind a network an episode's first transitions are not stored: the policy had seen nothing.
+        Behind a network an episode's first ones are left out: the policy had no observation yet.
         """
-        self._seen.append(transition.observation)
-        if len(self._seen) < (self._seen.maxlen or 1):
+        self._observations.append(transition.observation)
+        if len(self._observations) < (self._observations.maxlen or 1):
             return
-        seen = [*self._seen, transition.next_observation]
-        ahead = [*self._seen, *transition.foreseen[1:]][: len(transition.foreseen)]
-        # Eq. 17's reward as printed, unless the overruled action is charged
+        before, after, *_ = *self._observations, transition.next_observation
+        ahead = [*self._observations, *transition.foreseen[1:]][: len(transition.foreseen)]
+        # Eq. 17 as printed, unless the overruled action is charged
         reward = transition.reward if self.algorithm.rewarded else 0.0
         charged = transition.penalised and self.config.penalty_on == HUMANS_ACTION
         reward = equations.shaped_reward(reward, self.config.intervention_penalty, charged, False)
         self.replay.add(
-            replace(transition, observation=seen[0], reward=reward, next_observation=seen[1],
+            replace(transition, observation=before, reward=reward, next_observation=after,
                     foreseen=tuple(ahead))
         )  # fmt: skip
 
@@ -121,10 +121,10 @@ class LearningThread:
         self._begun = self._thread.submit(self._update, beta)
 
     def _scale_rewards(self) -> None:
-        """Bring the largest return to the range for which the losses' weights were chosen.
+        """Scale rewards so that the largest return is about 10, as in our scenarios.
 
-        That is our scenarios' own. Small ones grow only before the first update: later the first
-        success may be a large one.
+        The losses' weights were chosen for that. Small returns are scaled up only before the first
+        update: later, the first success may bring a large one.
         """
         if self._scenario in SCENARIOS:
             return
@@ -135,16 +135,16 @@ class LearningThread:
             self.replay.reward_scale *= USUAL_RETURN / scaled
 
     def finish(self) -> float:
-        """Wait for the update that was begun, if one was; return the seconds waited.
+        """Wait for the update under way, if any; return the seconds waited.
 
-        What the update raised comes out here; UserError where learning has diverged.
+        Raises the update's own exception, or UserError if learning has diverged.
         """
         if self._begun is None:
             return 0.0
         began_s = time.perf_counter()
         update, self._begun = self._begun, None
         batches, done, learning_s = update.result()
-        self._follow()
+        self._refresh_actor()
         if not all(np.isfinite(losses.priorities).all() for losses in done):
             raise diverged("losses")
         waited_s = time.perf_counter() - began_s
@@ -156,10 +156,10 @@ class LearningThread:
         return waited_s
 
     def end_episode(self, progress: float, keep: bool = True) -> dict[str, Any]:
-        """Let the rates fall; return what was learned since the last call, for `EpisodeMetrics`.
+        """Decay the learning rates; return the learner's fields of `EpisodeMetrics`.
 
-        ``progress`` is the run's, 0 to 1. Losses are nan where there was no update. ``keep`` is
-        False where a person discards the episode, which only `UnhurriedLearning` can still forget.
+        ``progress`` is the run's, 0 to 1. Losses are means since the last call, nan without update.
+        ``keep`` is False if a person discards the episode; only `UnhurriedLearning` can forget it.
         """
         self.learner.decay(progress)
         self._begin_actor_anew(progress)
@@ -183,11 +183,11 @@ class LearningThread:
             self._renewed = due
             batches = (self.replay.show(FRESH_BATCH_SIZE, self._random) for _ in count())
             self.in_thread(self.learner.begin_actor_anew, batches)
-            self._follow()
+            self._refresh_actor()
 
     def release(self, keep: bool = True) -> None:
-        """Let the next transition begin an episode; store, or forget, what was kept back."""
-        self._seen.clear()
+        """End the episode; `UnhurriedLearning` stores its steps now, if ``keep``."""
+        self._observations.clear()
         self.replay.end_episode()
 
     def check_weights(self) -> None:
@@ -210,13 +210,13 @@ class LearningThread:
         self.replay.load_state_dict(state["replay"])
         self._random.bit_generator.state = state["drawing"]
         self._fitted, self._renewed = state["fitted"], state["renewed"]
-        self._follow()
+        self._refresh_actor()
 
     def close(self) -> None:
         self._thread.shutdown()
 
     def _update(self, beta: float) -> tuple[list[Batch], list[Losses], float]:
-        """Draw and learn; while a GPU learns from a batch the next is drawn."""
+        """Draw minibatches and learn; a GPU learns from one while the next is drawn."""
         began_s = time.perf_counter()
         batches, begun = list[Batch](), list[torch.Tensor]()
         for _ in range(self.config.updates_per_step):
@@ -225,8 +225,8 @@ class LearningThread:
         losses = [Losses.of(figures) for figures in begun]
         return batches, losses, time.perf_counter() - began_s
 
-    def _follow(self) -> None:
-        """Act by the actor's present weights."""
+    def _refresh_actor(self) -> None:
+        """Copy the learned weights to the actor that acts."""
         self.in_thread(self._copy_actor)
 
     def _copy_actor(self) -> None:
@@ -242,14 +242,14 @@ class LearningThread:
 class UnhurriedLearning(LearningThread):
     """A learner beside a person: ``act``, ``begin`` and ``finish`` never wait for an update.
 
-    The policy acts in the loop's thread, as of the last finished update.
+    The policy acts in the loop's thread, with the weights of the last finished update.
     An episode's steps are stored at its end, when it is known whether the person discards it.
     """
 
     def __init__(self, config: RunConfig, env: Any) -> None:
         super().__init__(config, env)
         self._kept: list[Transition] = []
-        # That thread alone
+        # Lowers that thread's priority alone.
         self.in_thread(lambda: os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS))
 
     def act(self, observation: Observation) -> Action:
@@ -260,7 +260,7 @@ class UnhurriedLearning(LearningThread):
 
     def begin(self, beta: float) -> None:
         """Start an update on what is stored, unless the last one is still under way."""
-        if self._tidy():
+        if self._collect():
             super().begin(beta)
 
     def finish(self) -> float:
@@ -281,16 +281,16 @@ class UnhurriedLearning(LearningThread):
         self.settle()
         return super().state_dict()
 
-    def _follow(self) -> None:
-        self._copy_actor()  # Nice as it is, the thread may let the loop wait.
+    def _refresh_actor(self) -> None:
+        self._copy_actor()  # Here: the thread's low priority could make the loop wait.
 
     def settle(self) -> None:
-        # In short waits: a signal that another thread took does not wake the main thread.
-        while not self._tidy():
+        # Short waits: a signal that another thread received does not wake the main thread.
+        while not self._collect():
             time.sleep(0.002)
 
-    def _tidy(self) -> bool:
-        """Finish an update that is done; return False where one is not."""
+    def _collect(self) -> bool:
+        """Collect a finished update; return False while one is running."""
         if self._begun is not None:
             if not self._begun.done():
                 return False

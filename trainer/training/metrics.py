@@ -1,4 +1,4 @@
-"""A run's metrics: its episodes as rows of CSV and of TensorBoard, and what they amount to."""
+"""A run's metrics: one row per episode, with running totals, in CSV and TensorBoard."""
 
 import csv
 import io
@@ -18,7 +18,7 @@ from trainer.util import fitting
 NAN = float("nan")
 METRICS_FILE = "metrics.csv"
 LEARNED = (0.9, 0.98)
-"""Success rates of the policy alone, in validation, whose cost is reported."""
+"""Success rates in validation; the human seconds until each are reported."""
 
 
 @dataclass
@@ -52,7 +52,7 @@ class EpisodeMetrics:
     storing_s: float = 0.0  # Time of drawing minibatches, storing steps and their new priorities
     learning_s: float = 0.0  # Time of the updates themselves, beside the parts above
     waiting_s: float = 0.0
-    """How long the loop waited for an update after the environment's step was done."""
+    """Time that the loop waited for an update after the environment's step was done."""
     validation_success: float = NAN
     """Success rate on the validation seeds (nan: no validation after this episode, or nothing tells
     whether a drive succeeded)."""
@@ -61,7 +61,7 @@ class EpisodeMetrics:
     """Mean return of the validation (nan: none); at equal success rates it decides which actor is
     kept."""
     confirmed_success: float = NAN
-    """Success rate on the second set of seeds (nan: no better than the kept actor before that)."""
+    """Success rate on the second set of seeds (nan: not driven, since the first was worse)."""
     confirmed_reward: float = NAN
 
 
@@ -116,18 +116,18 @@ class MetricsWriter:
 
 
 def read_metrics(run_dir: Path) -> list[dict[str, str]]:
-    """Read the rows of a run, none where it has none.
+    """Read the rows of a run; none without a file.
 
-    A row that was cut off at the end is left out: no checkpoint comes before its row is whole.
+    A row cut off at the end is left out: a checkpoint is written only after its row is complete.
     Raises UserError for a file that is damaged, or not of this project.
     """
     path = run_dir / METRICS_FILE
     if not path.exists():
         return []
     with fitting(f"{path} is no metrics of a training, or damaged"):
-        # As csv ends lines: an outcome may hold what `str.splitlines` takes for another end.
-        whole, end, _ = read_bytes(path, "metrics").rpartition(b"\n")
-        text = io.StringIO((whole + end).decode(), newline="")
+        # Split as csv does: an outcome may hold other line ends of `str.splitlines`.
+        complete, end, _ = read_bytes(path, "metrics").rpartition(b"\n")
+        text = io.StringIO((complete + end).decode(), newline="")
         rows = list(csv.DictReader(text, strict=True))
         for number, row in enumerate(rows):
             values = {name: KINDS[name](text) for name, text in row.items()}

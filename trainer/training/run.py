@@ -60,7 +60,7 @@ def environment_of(config: RunConfig) -> Any:
 
 
 Score = tuple[float, float]
-"""Share of successes and mean return; the second decides where the first is equal."""
+"""Share of successes and mean return, which decides between equal shares."""
 
 
 def score(drives: Sequence[EpisodeResult]) -> Score:
@@ -69,9 +69,9 @@ def score(drives: Sequence[EpisodeResult]) -> Score:
 
 
 class Trials:
-    """The validation's episodes: a policy drives them without help, over the run's network.
+    """Drives the validation's episodes with a policy alone, over the run's network.
 
-    ``env`` exists already: some simulators allow only one in a process.
+    ``env`` is the run's own, reused because some simulators allow only one in a process.
     """
 
     def __init__(self, config: RunConfig, env: Any = None) -> None:
@@ -92,7 +92,7 @@ class Trials:
         return [self._env or environment_of(c)]
 
     def drive(self, driver: TogetherDriver, best: Score) -> list[EpisodeResult]:
-        """Drive a validation; after one no worse than ``best`` the second set of drives, too."""
+        """Drive a validation; if its score is at least ``best``, also drive the second set."""
         drives = self._drive(driver, self._seeds)
         if self._confirming and score(drives) >= best:
             drives += self._drive(driver, self._confirming)
@@ -105,11 +105,11 @@ class Trials:
 
 
 class Validation(Trials):
-    """Drives the policy as it stands, and keeps the best actor so far.
+    """Validates the present policy, and keeps the best actor so far.
 
     The best of many validations overestimates its actor. So an actor that does no worse than the
-    kept one drives a second, larger set of episodes, and replaces that one if it does no worse
-    there.
+    kept one drives a second, larger set of episodes, and replaces the kept one if it does no worse
+    there, either.
     """
 
     def __init__(
@@ -122,9 +122,9 @@ class Validation(Trials):
         self._best_actor: dict[str, Any] | None = None  # As in its file; None before the first one
 
     def after(self, metrics: EpisodeMetrics, episode: int, due: bool, at_end: bool) -> None:
-        """Validate after ``episode`` episodes where that is ``due``.
+        """Validate after ``episode`` episodes if ``due``.
 
-        Not where a run is stopped, ``at_end``: that must not decide which actor it ends with.
+        Stopping (``at_end``) adds no validation: it must not change which actor a run keeps.
         """
         if due:
             actor = getattr(self.learning.learner, self.config.kept_actor)
@@ -134,21 +134,21 @@ class Validation(Trials):
     def take(
         self, results: Sequence[EpisodeResult], actor: Actor, metrics: EpisodeMetrics, episode: int
     ) -> None:
-        """Enter an actor's drives into ``metrics``, and keep the actor if it is the best."""
+        """Write an actor's results to ``metrics``, and keep the actor if it is the best."""
         count = self.config.evaluation_runs
         results, confirming = results[:count], results[count:]
-        found = success, metrics.validation_reward = score(results)
+        validated = success, metrics.validation_reward = score(results)
         metrics.validation_success = (
             success if is_told(result.outcome for result in results) else math.nan
         )
         metrics.validation_distance_m = float(np.mean([result.distance_m for result in results]))
-        confirmed = found
+        confirmed = validated
         if confirming:
             confirmed = metrics.confirmed_success, metrics.confirmed_reward = score(confirming)
         elif self.config.confirmation_factor:
             return
-        if found >= self.best and confirmed >= self.confirmed:
-            self.best, self.confirmed = found, confirmed
+        if validated >= self.best and confirmed >= self.confirmed:
+            self.best, self.confirmed = validated, confirmed
             state = {**self.config.label(episode), "actor": actor.state_dict()}
             self._best_actor = copy.deepcopy(state)
             util.save_torch(self.run_dir / BEST_FILE, state)
@@ -158,7 +158,7 @@ class Validation(Trials):
         return {**scores, "best_actor": self._best_actor}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take up ``state_dict``, and write its best actor again."""
+        """Restore a ``state_dict``, and write its best actor's file again."""
         scores = (map(float, state[f"best_{name}"]) for name in ("validation", "confirmed"))
         self.best, self.confirmed = ((success, reward) for success, reward in scores)
         self._best_actor = state["best_actor"]
@@ -170,14 +170,14 @@ NOBODY = Guide()
 
 
 def make_guide(config: RunConfig, env: Any) -> Guide:
-    """Make the human of a run as its config describes it."""
+    """Make the human that a run's config describes."""
     row = find_algorithm(config.algorithm)
     random = util.random_stream(config.seed, util.Purpose.GUIDANCE)
     if not row.guided:
         return Guide()
     driver, _ = evaluation.load_driver(config.human, env)
-    named = config.human if evaluation.is_expert(config.human) else "expert"
-    expert = environments.expert_of(env, named)
+    expert_name = config.human if evaluation.is_expert(config.human) else "expert"
+    expert = environments.expert_of(env, expert_name)
     attention, hands, period_s = None, None, env.control_period_s
     if config.late_to_s or config.missed_share:
         late_steps = config.late_from_s / period_s, config.late_to_s / period_s
@@ -211,10 +211,10 @@ class TrainingRun:
         learning: LearningThread | None = None,
         validation: Validation | None = None,
     ) -> None:
-        """Each part is by default the one that the config describes."""
+        """Make the parts that are not given as the config describes them."""
         self.config, self.run_dir = config, run_dir
         self.algorithm = find_algorithm(config.algorithm)
-        self.env = env or environment_of(config)  # It is foreseen in.
+        self.env = env or environment_of(config)  # Copied for look-ahead
         if self.algorithm.foresight:
             environments.check_foresight(self.env)
         network = parse_spec(config.latency)
@@ -227,11 +227,11 @@ class TrainingRun:
         self.act = self.delayed.behind(self._explore) if self.delayed else self._explore
         self.exploration = util.random_stream(config.seed, util.Purpose.EXPLORATION)
         self.episode = self.steps = 0
-        """Episodes driven, and environment steps in those that were not discarded."""
-        self.quitting = False  # The episode under way is to be the last of this call
-        self.found = False
+        """Episodes driven, and environment steps in those that a person has not discarded."""
+        self.quitting = False  # End ``train`` after the episode under way
+        self.has_succeeded = False
         """Whether an episode has succeeded, in training or validation, or success is unknown."""
-        self._shown_steps = 0  # Of the human in demonstrations; the first episode counts them
+        self._shown_steps = 0  # Human steps in demonstrations; the first episode's row counts them
         if resume:
             path = run_dir / CHECKPOINT_FILE
             with util.fitting(f"{path} does not fit this run"):
@@ -249,7 +249,7 @@ class TrainingRun:
         deadline_s: float = math.inf,
     ) -> None:
         """Train until the configured end, or ``time.monotonic() > deadline_s``; call it once."""
-        if not self.over:  # Else another revision has trained it.
+        if not self.over:  # A finished run keeps the revision that trained it.
             about = {**asdict(self.config), "source_revision": util.source_revision()}
             write_json(self.run_dir / CONFIG_FILE, about)
         metrics_writer = MetricsWriter(self.run_dir, self.episode, self.env.control_period_s)
@@ -260,10 +260,10 @@ class TrainingRun:
                 at_end = self.over or self.guide.stop or time.monotonic() > deadline_s
                 due = self._due(before)
                 self.validation.after(metrics, self.episode, due, at_end)
-                self.found |= metrics.outcome == GOAL or not is_told([metrics.outcome])
-                self.found |= due and metrics.validation_success > 0.0
+                self.has_succeeded |= metrics.outcome == GOAL or not is_told([metrics.outcome])
+                self.has_succeeded |= due and metrics.validation_success > 0.0
                 metrics_writer.add(metrics)
-                ending = at_end or self.quitting  # Read once, so that every end is saved.
+                ending = at_end or self.quitting  # Read once: a signal may change it.
                 if ending or self.episode % self.config.checkpoint_every == 0:
                     self.save()
                 on_episode(metrics)
@@ -302,7 +302,7 @@ class TrainingRun:
             "steps": self.steps,
             "kept_actor": self.config.kept_actor,
             "exploration": self.exploration.bit_generator.state,
-            "found": self.found,
+            "found": self.has_succeeded,
             **self.validation.state_dict(),
         }
         util.save_torch(self.run_dir / CHECKPOINT_FILE, state)
@@ -312,7 +312,7 @@ class TrainingRun:
         self.episode, self.steps, _ = msgspec.convert(counts, list[Annotated[int, Meta(ge=0)]])
         self.learning.load_state_dict(state["learning"])
         self.exploration.bit_generator.state = state["exploration"]
-        self.found = state["found"]
+        self.has_succeeded = state["found"]
         self.guide.load_state_dict(state)
         self.validation.load_state_dict(state)
 
@@ -322,7 +322,7 @@ class TrainingRun:
         self._shown_steps = 0
         seed = util.episode_seed(config.seed, util.Purpose.TRAINING, self.episode)
         observation, info = self.vehicle.reset(seed=seed)
-        self._drawn = np.zeros(self.env.action_space.shape)
+        self._noise = np.zeros(self.env.action_space.shape)
         guide = self.guide if config.guided(self.episode) else NOBODY
         self.guide.reset()
         ended = False
@@ -345,7 +345,7 @@ class TrainingRun:
     def _step(
         self, observation: Observation, guide: Guide, metrics: EpisodeMetrics
     ) -> tuple[Observation, bool, dict[str, Any]]:
-        """One control period: act, let the human take over and the car move; meanwhile, learn."""
+        """Drive one control period (policy, human, environment) while the learner updates."""
         began_s = time.perf_counter()
         policy_action = self.act(observation)
         asks = self.algorithm.asks and guide is not NOBODY
@@ -385,10 +385,10 @@ class TrainingRun:
         return next_observation, terminated or truncated, info
 
     def penalises(self, intervention: Intervention | None) -> bool:
-        """Return whether an intervention begins that costs the policy (eq. 17).
+        """Return whether a penalised intervention begins (eq. 17).
 
-        Help that was asked for is no objection. A stuck car looks like one that rightly waits: a
-        penalty would teach to fear waiting.
+        Help that the robot asked for is not penalised. Nor, if rewards count, is freeing a stuck
+        car: it looks like one that rightly waits, and a penalty would teach never to wait.
         """
         row = self.algorithm
         if intervention is None or not intervention.first or not row.penalty:
@@ -397,26 +397,26 @@ class TrainingRun:
 
     def _explore(self, observation: Observation) -> Action:
         action = self.learning.act(observation)
-        if not np.isfinite(action).all():  # No car is to be driven by it.
+        if not np.isfinite(action).all():  # Never drive a car with them.
             raise diverged("actions")
         c, std = self.config.learner, self._exploration_std()
-        self._drawn = equations.correlated(self._drawn, c.exploration_correlation, self.exploration)
-        noise = equations.exploration_noise(std, c.exploration_bound, self._drawn)
+        self._noise = equations.correlated(self._noise, c.exploration_correlation, self.exploration)
+        noise = equations.exploration_noise(std, c.exploration_bound, self._noise)
         return np.clip(action + noise, -1.0, 1.0)
 
     def _exploration_std(self) -> float:
         c = self.config.learner
         left = max(0.0, 1.0 - self.progress / c.exploration_share)
-        if left and not self.found and c.exploration_searching:
+        if left and not self.has_succeeded and c.exploration_searching:
             return c.exploration_searching
         return c.exploration_final + (c.exploration_initial - c.exploration_final) * left
 
     def _beta(self) -> float:
-        """Return eq. 15's exponent: zero at a run's end, or where its weights are not used."""
+        """Return eq. 15's exponent, which falls to zero; zero if importance weights are off."""
         c = self.config.learner
         return c.beta * (1.0 - self.progress) if c.importance_sampling else 0.0
 
     def _due(self, steps_before: int) -> bool:
-        """Return whether a run that is never stopped validates here."""
+        """Return whether a validation is due, no matter where the run was stopped before."""
         every = self.config.evaluate_every_steps
         return bool(every) and (self.over or self.steps // every > steps_before // every)
