@@ -11,11 +11,11 @@ RANGES = {(1, 2): ("frames",), FROM_ONE: ("batch_size", "episodes", "updates_per
 
 @dataclass(frozen=True)
 class HumanModelConfig:
-    """Tables A4 and A7, and what they leave open."""
+    """Settings of tables A4 and A7, and those that the paper leaves open."""
 
     frames: int = 1
     """Frames that the model sees (table A4: one). Two show speed: in the left turn the model then
-    gets about 20.5 m far instead of 18.4 to 20.2. The congestion needs only one."""
+    drives about 20.5 m instead of 18.4 to 20.2. The congestion needs only one."""
     learning_rate: float = 1e-4
     """Table A7."""
     batch_size: int = 128
@@ -28,8 +28,8 @@ class HumanModelConfig:
     """The person drives one whole episode in this many, from the second on; 0: never.
     Interventions alone, the paper's only source, show little of ordinary good driving."""
     label_every_step: bool = False
-    """At every step that the model drives, also learn what the person would do. A scripted expert
-    can say it (DAgger as of Ross et al. 2011), a person cannot. Interventions alone do not correct
+    """At every step that the model drives, also learn the scripted expert's action, which a person
+    could not give (DAgger as of Ross et al. 2011). Interventions alone do not correct
     small errors, such as standing too far from the line."""
     refining_updates: int = 0
     """Gradient steps after the last episode, with a learning rate that falls to zero. Not in the
@@ -42,4 +42,4 @@ class HumanModelConfig:
 
 FIXED = ("learning_rate", "batch_size")
 FIELDS = [field.name for field in fields(HumanModelConfig) if field.name not in FIXED]
-"""Those with an option of their own."""
+"""Fields with an option of their own."""

@@ -19,21 +19,21 @@ class CongestionHuman(Expert):
     1.3 s, without overshoot.
     """
 
-    AHEAD_M = 12.0  # How far ahead a car counts as a neighbour, centre to centre ...
-    BEHIND_M = 6.0  # ... and how far behind
+    AHEAD_M = 12.0  # A car counts as a neighbour up to this far ahead, centre to centre
+    BEHIND_M = 6.0  # and up to this far behind
     MIDDLE_LIMIT_M = 0.4
-    """Maximum distance from the lane's middle: a gap in a neighbouring lane is no invitation."""
+    """Maximum distance from the lane's middle: the car keeps out of gaps in the next lane."""
     HEADING_RAD_PER_M = 0.15
     HEADING_LIMIT_RAD = 0.12
     STEERING_GAIN = 3.0
 
     HORIZON_S = 0.6
-    """How far ahead the judged steering is followed: long enough that the human can always rescue
-    the car, and no longer. A human who takes over at the first drift keeps the policy from all
+    """Time for which the judged steering is predicted: long enough that the human can always rescue
+    the car, and no longer. A human who takes over at the first drift leaves the policy no
     experience; without imitation (HI-TD3) it then learns hardly anything."""
     MARGIN_M = 0.25  # A car that comes nearer than this counts as hit
-    HEADING_RAD = 0.2
-    OFFSET_M = 1.1  # From the lane's middle
+    HEADING_RAD = 0.2  # Largest heading after one step
+    OFFSET_M = 1.1  # Largest distance from the lane's middle at the prediction's end
 
     def __init__(self, env: CongestionEnv) -> None:
         self.env = env
@@ -95,9 +95,9 @@ class CongestionHuman(Expert):
         return shapes
 
     def _hits(self, ego: Rectangle, ahead_s: float) -> bool:
-        """Whether a car beside it is then, at its present speed, nearer than the margin.
+        """Whether a car of a neighbouring lane, at constant speed, will be within the margin.
 
-        Only sideways: the pedals see to the room ahead.
+        The pedals, not the steering, keep the distance to cars in the ego car's own lane.
         """
         wider = ego._replace(width=ego.width + 2.0 * self.MARGIN_M)
         for car in self.env.traffic:

@@ -11,9 +11,9 @@ from trainer.learner.replay import Action, Observation, Transition
 
 Reason = str  # Why the human takes over
 STUCK, ASKED, BY_PERSON = "stuck", "asked", "person"
-"""It waits for nothing; the robot asked for help; a person took over. Our scenarios' experts have
-``collision``, ``lane`` (it stops in the traffic's), ``heading`` and ``offset``, too."""
-HOLD_S = 1.5
+"""The car waits for nothing; the robot asked for help; a person took over. Our scenarios' experts
+also give ``collision``, ``lane`` (it stops in the traffic's lane), ``heading`` and ``offset``."""
+HOLD_S = 1.5  # How long a human drives at least after the last reason
 
 
 class Driver(Protocol):
@@ -29,7 +29,7 @@ class Driver(Protocol):
 
 
 class Expert(Driver, Protocol):
-    """The scripted human of an environment: drives from the true state, and says when to take over.
+    """The scripted human of an environment: drives from the true state, decides when to take over.
 
     These are the activation conditions of section V.
     """
@@ -57,11 +57,11 @@ class Intervention:
 
 
 Record = Callable[[Transition, Intervention | None, dict[str, Any]], None]
-"""Takes a control period and the info of its step, once it is stored: a view, or a recording."""
+"""Called with each stored control period and its step's info, by a view or a recording."""
 
 
 class GuideGone(Exception):  # noqa: N818 (no error: it was asked for)
-    """A person has quit before an episode began."""
+    """Raised where a person quits before an episode has begun."""
 
 
 class Guide:
@@ -90,14 +90,14 @@ class Guide:
         return {}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take up what ``state_dict`` gave."""
+        """Restore a ``state_dict``."""
 
 
 class Asking:
     """Lets the robot ask for help where its critics differ most; the human need not watch.
 
-    It asks where the doubt is among the ``share`` of the highest of late, as ThriftyDAgger does
-    (2109.08273). Until it knows which doubts are high, the human watches.
+    It asks where the doubt is in the highest ``share`` of the recent doubts, as ThriftyDAgger does
+    (2109.08273). Until it has seen ``MEMORY`` doubts, the human watches.
     """
 
     MEMORY = 500  # Control periods
@@ -115,11 +115,11 @@ class Asking:
 
 
 class Attention:
-    """The attention of a human who comes late, or overlooks a reason and then is blind for a while.
+    """Delays a human's take-over, or lets the human miss a reason and then all for a while.
 
-    ``late_steps``: least and longest delay in control periods, drawn anew for each take-over;
-    ``missed_share``: how often the human notices nothing. What a late human takes over from, and
-    what is penalised, is what the policy does by then.
+    ``late_steps``: minimum and maximum delay in control periods, drawn for each take-over;
+    ``missed_share``: how often the human misses a reason. A late human overrules, and penalises,
+    the policy's action at the take-over, not the one that gave the reason.
     """
 
     BLIND_STEPS = 15
@@ -136,7 +136,7 @@ class Attention:
         self._steps_left = 0
 
     def notices(self, reason: Reason | None) -> Reason | None:
-        """Return the reason once the delay has passed; a begun take-over is not given up."""
+        """Return the reason once the delay has passed, even if it is gone by then."""
         if self._steps_left == 0:
             if reason is None:
                 return None
@@ -149,9 +149,9 @@ class Attention:
 
 
 class PoorHands:
-    """Makes a share of a human's actions wrong: ``biased``, always the same, or drawn each time.
+    """Replaces a share of a human's actions by wrong ones: always ``biased``, or random if None.
 
-    ``whole``: a share of the take-overs instead, each from its beginning to its end.
+    ``whole``: replaces a share of the take-overs instead, each from its beginning to its end.
     """
 
     def __init__(
@@ -161,7 +161,7 @@ class PoorHands:
         self._wrong = False
 
     def spoil(self, action: Action, first: bool) -> Action:
-        """Return the action, or a wrong one in its place; ``first``: of a take-over."""
+        """Return the action or a wrong one; ``first``: whether a take-over begins."""
         if first or not self.whole:
             self._wrong = self.random.random() < self.share
         if not self._wrong:
@@ -172,16 +172,16 @@ class PoorHands:
 
 
 def steps_held(period_s: float) -> int:
-    """Return for how many control periods a human holds the wheel."""
+    """Return ``HOLD_S`` in control periods."""
     return round(HOLD_S / period_s)
 
 
 class HumanGuide(Guide):
-    """Turns the trigger of a scripted human and a driver into interventions.
+    """Takes over where ``trigger``, a scripted human, gives a reason; ``driver`` then drives.
 
-    The human stays in control for ``hold_steps`` from the last reason for it: a person first brings
-    the car out of what made them take over. Where the robot asks, it is a third of that: nothing is
-    wrong yet. At the wheel every human is attentive.
+    The human stays in control for ``hold_steps`` after the last reason: a person first brings the
+    car out of danger. If the robot asked, a third of that is enough: nothing is wrong yet. While in
+    control, every human is attentive.
     """
 
     def __init__(
@@ -212,13 +212,13 @@ class HumanGuide(Guide):
         self, observation: Observation, policy_action: Action, doubt: float = 0.0
     ) -> Intervention | None:
         """Return what the human does instead of ``policy_action``, if anything."""
-        trigger, before = self.trigger.wants_control(policy_action), self._reason
+        reason, before = self.trigger.wants_control(policy_action), self._reason
         if self.asking:
-            trigger = self.asking.ask(doubt, trigger)
+            reason = self.asking.ask(doubt, reason)
         if before is None and self.attention:
-            trigger = self.attention.notices(trigger)
-        if trigger is not None:
-            hold_steps = max(self.hold_steps // 3, 1) if trigger == ASKED else self.hold_steps
+            reason = self.attention.notices(reason)
+        if reason is not None:
+            hold_steps = max(self.hold_steps // 3, 1) if reason == ASKED else self.hold_steps
             self._steps_left = max(self._steps_left, hold_steps)
         if self._steps_left == 0 and (before is None or self.trigger.may_return()):
             self._reason = None
@@ -227,7 +227,7 @@ class HumanGuide(Guide):
         if before is None:
             # A person who takes over looks at the scene afresh.
             self.driver.reset()
-            self._reason = trigger
+            self._reason = reason
         assert self._reason is not None
         action = self.driver.act(observation)
         action = self.hands.spoil(action, before is None) if self.hands else action
@@ -240,7 +240,7 @@ class HumanGuide(Guide):
         return {"guidance": random, "doubts": list(doubts)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take up what ``state_dict`` gave."""
+        """Restore a ``state_dict``."""
         if self.random:
             self.random.bit_generator.state = state["guidance"]
         if self.asking:

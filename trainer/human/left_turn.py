@@ -29,7 +29,7 @@ class PedalPlan:
 
 
 class Crossing:
-    """Foresight for one left-turn environment, with ``side_clearance_m`` beside passing cars."""
+    """Predicts conflicts in a left turn, with ``side_clearance_m`` beside passing cars."""
 
     def __init__(self, env: LeftTurnEnv, side_clearance_m: float) -> None:
         self.env = env
@@ -42,12 +42,12 @@ class Crossing:
         self._covered_x = np.array(stretch)
 
     def clear(self, horizon_s: float, margin_m: float, plan: PedalPlan) -> bool:
-        """Whether nothing comes within ``margin_m`` along the lane during ``horizon_s``."""
+        """Whether no car comes within ``margin_m`` along the lane during ``horizon_s``."""
         s_m, _ = self._ego_motion(horizon_s, plan)
         time_s = np.linspace(0.0, (len(s_m) - 1) * self.env.config.control_period_s, len(s_m))
         cells = np.minimum((s_m / TABLE_STEP_M).astype(int), len(self._covered_x) - 1)
         rear_x, front_x = self._covered_x[cells].T
-        # All cars at once; the shape also holds without cars.
+        # All cars at once; the reshape also works without cars.
         cars = [(car.position[0], car.speed, car.LENGTH) for car in self.env.traffic]
         x, speed_mps, length_m = np.array(cars).reshape(-1, 3).T[:, :, None]
         car_x, reach_m = x + speed_mps * time_s, 0.5 * length_m + margin_m
@@ -104,10 +104,10 @@ def _stretch_in_strip(shape: Rectangle, low_y: float, high_y: float) -> tuple[fl
 
 
 class LeftTurnHuman(Expert):
-    """Waits at the stop line, picks a gap, and then commits; and judges the policy's action.
+    """Waits at the stop line, picks a gap, then commits to it; also judges the policy's action.
 
-    Whoever changes their mind with the nose in the lane is hit. To need a wide gap to start and a
-    narrow one to go on is safe, and easier to imitate.
+    A car that stops with its nose in the lane is hit. So starting needs a wide gap, and going on
+    only a narrow one, which is safe and easier to imitate.
 
     As a judge it accepts what leaves a way out and does not stop in the lane. To follow the present
     pedal alone would be to object to each brisk approach, the expert's own included; but theorem 1
@@ -129,18 +129,18 @@ class LeftTurnHuman(Expert):
 
     HOLD_S = 0.5  # Time for which the judged pedal is held: a person's reaction time
     RESCUE_BRAKE = 0.85
-    """Share of the full brake that must then still stop the car in time; the rest is a reserve for
-    a human model."""
+    """Share of the full brake that must still stop the car in time after ``HOLD_S``; the rest is a
+    reserve for a human model."""
     STOP_BY_M = POINT_OF_NO_RETURN_M - 0.5
-    """Path length by which the car must then stand; creeping up to the point of no return, past
-    which a car can only drive on, is not waiting."""
+    """Path length by which the car must then stand: a car that creeps up to the point of no return,
+    past which it can only drive on, is not waiting."""
     RESCUE_MARGIN_M = 1.0
-    """Room along the lane that must then be left for driving on at full throttle."""
+    """Distance to cars along the lane that driving on at full throttle must then keep."""
     HESITATION_S = 1.0
-    """Time for which a car that would then be in the lane holds the judged pedal."""
+    """Time for which the judged pedal is predicted, to see whether the car stops in the lane."""
     CRAWL_MPS = 1.5
-    """A car that would then be slower than this in the lane is stopping there: a fault, since the
-    traffic does not yield."""
+    """A car predicted to be slower than this in the lane counts as stopping there: a fault, since
+    the traffic does not yield."""
     STANDING_MPS = 0.3
     STANDING_STEPS = 15  # Steps after which a standing car counts as waiting
     OPEN_STEPS = 5
@@ -219,10 +219,10 @@ class LeftTurnHuman(Expert):
 
 
 class SlowHuman(LeftTurnHuman):
-    """A human who drives slower than the reward asks for.
+    """A human who drives slower than the reward's target speed.
 
-    All of its drives arrive, too (40 of 40), after 10.4 s instead of 7.9 s, with a return of 3.8
-    instead of 6.2.
+    All of its drives reach the goal, too (40 of 40), after 10.4 s instead of 7.9 s, with a return
+    of 3.8 instead of 6.2.
     """
 
     CRUISE_MPS = 3.0

@@ -1,4 +1,4 @@
-"""The DAgger human model of section V, which imitates the human's actions so far."""
+"""Train the DAgger human model of section V, which imitates a human's actions."""
 
 import argparse
 import sys
@@ -60,8 +60,8 @@ class HumanModel(Driver):
         return self.actor.act(observation[None])[0]
 
     def add(self, observation: NDArray[Any], action: NDArray[np.float32]) -> None:
-        seen = observation[-self.config.frames :] if self._pictures else observation
-        self._observations.append(seen.copy())
+        frames = observation[-self.config.frames :] if self._pictures else observation
+        self._observations.append(frames.copy())
         self._actions.append(np.asarray(action, dtype=np.float32))
 
     def learn(self, updates: int) -> float:
@@ -89,7 +89,7 @@ class HumanModel(Driver):
             self.learn(each + (part < rest))
 
     def save(self, directory: Path, about: dict[str, Any]) -> None:
-        """Write the model to ``directory``, with ``about``, which says on what it was trained."""
+        """Write the model to ``directory``, with ``about``, a description of its training."""
         state = {
             "actor": self.actor.state_dict(),
             "frames": self.config.frames,
@@ -101,7 +101,7 @@ class HumanModel(Driver):
 
 
 def load_human_model(directory: Path, env: Any) -> tuple[Actor, dict[str, Any]]:
-    """Load a HUMAN_DIR: its network and all else; UserError: it holds no human model of ``env``."""
+    """Load a HUMAN_DIR: network and description; UserError: it holds no human model of ``env``."""
     path = directory / MODEL_FILE
     state = load_torch(path)
     with util.fitting(f"{path} is not a human model of this project"):
@@ -114,7 +114,7 @@ def load_human_model(directory: Path, env: Any) -> tuple[Actor, dict[str, Any]]:
 def run(arguments: argparse.Namespace) -> int:
     util.set_threads(arguments.threads)
     if arguments.recordings is not None and arguments.label_every_step:
-        raise UserError("--label-every-step asks the scripted expert; a recording holds no more")
+        raise UserError("--label-every-step needs the scripted expert; recordings lack labels")
     config = HumanModelConfig(**{name: getattr(arguments, name) for name in FIELDS})
     directory = Path(arguments.out)
     with claimed(directory):
@@ -138,7 +138,7 @@ def _train(arguments: argparse.Namespace, config: HumanModelConfig, directory: P
             taken_over = demonstrate(model, recordings, env.scenario)
             model.learn(0)  # It raises where shapes differ.
         about |= {"recordings": [str(path) for path in recordings], "interventions": taken_over}
-        # As many gradient steps as with the expert, without the episodes between them
+        # As many gradient steps as with the expert, but without episodes in between
         losses = (model.learn(config.updates_per_episode) for _ in range(config.episodes))
     status = 0
     try:
@@ -147,7 +147,7 @@ def _train(arguments: argparse.Namespace, config: HumanModelConfig, directory: P
                 bar.advance({"demonstrations": str(model.demonstrations), "loss": f"{loss:.3f}"})
                 if time.monotonic() > end_s:
                     break
-        # In proportion: part of the episodes have shown part of the examples, in part of the time.
+        # In proportion to the episodes: fewer have shown fewer examples.
         model.refine(config.refining_updates * bar.done // config.episodes)
     except KeyboardInterrupt:
         if not bar.done:
@@ -167,7 +167,7 @@ def imitate(model: HumanModel, env: Any, seed: int) -> Iterator[float]:
     Yields the loss after each episode.
     """
     config = model.config
-    # Three, as each has a memory: a person who takes over looks at the scene afresh.
+    # Three experts (driver, adviser, trigger), since each has a memory of its own.
     expert, adviser = expert_of(env), expert_of(env)
     guide = HumanGuide(expert, expert_of(env), steps_held(env.control_period_s))
     for episode in range(config.episodes):

@@ -1,4 +1,4 @@
-"""What the scenarios share: the ego car, the traffic, spaces, frames, and the report of a step.
+"""Common parts of the scenarios: ego car, traffic, spaces, frames, and the result of a step.
 
 Traffic is highway-env's IDM within a lane, the intelligent driver model of Treiber, Hennecke and
 Helbing (2000); in the congestion it also controls the ego car's pedals. Cars are blind to the ego
@@ -87,7 +87,7 @@ class EgoVehicle(Vehicle):
 
 EXPONENT = 4.0
 LEAST_GAP_M = 0.1
-"""A gap is taken to be at least this; one that closes to nothing is a crash anyway."""
+"""Smaller gaps count as this, so that none is divided by 0; at 0 the cars crash anyway."""
 
 
 def idm_acceleration(
@@ -155,7 +155,7 @@ def equip(
 ) -> None:
     """Give each vehicle, after its leader, its type's size and IDM parameters.
 
-    ``time_gap_factor``: share of the type's time gap; people close up in a jam.
+    ``time_gap_factor``: factor on the type's time gap; drivers close up in a jam.
     """
     for car, kind in zip(cars, types, strict=True):
         car.LENGTH, car.WIDTH = kind.length_m, kind.width_m
@@ -209,7 +209,7 @@ class TrafficVehicle(IDMVehicle):
         closing_mps = self.speed - leader.speed * math.cos(leader.heading)
         approach_m = self.speed * closing_mps / (2.0 * math.sqrt(-a * self.COMFORT_ACC_MIN))
         gap_m = self.DISTANCE_WANTED + self.speed * self.TIME_WANTED + approach_m
-        # Along the lane, each from its start.
+        # Positions along the lane, from its start.
         x, ahead_x = self.position.item(0), leader.position.item(0)
         share = gap_m / not_zero((ahead_x - self._start_m) - (x - self._start_m))
         return wanted - a * (share * share)
@@ -275,9 +275,9 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
     action_range = (np.full(1, -1.0, np.float32), np.full(1, 1.0, np.float32))
     rest_action = np.zeros(1, np.float32)  # Hands off
     keys: Mapping[str, tuple[float, ...]]  # Key -> the action while a person holds it
-    key_rate_per_s: float  # How quickly a key presses
+    key_rate_per_s: float  # Change of the action while a key is held
     biased_action: float  # The wrong action of biased guidance
-    expert_class: str  # By its name: its module imports the scenario
+    expert_class: str  # A name, because its module imports the scenario
     scenes: ClassVar[Mapping[Scene, Any]]  # Their configs
     config: ScenarioConfig
     ego: EgoVehicle
@@ -334,11 +334,11 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
         raise NotImplementedError
 
     def _frame(self, ego: Rectangle, cars: list[Rectangle]) -> NDArray[np.uint8]:
-        """Draw the policy's picture, uint8 [45, 80], from the footprints of ego car and traffic."""
+        """Draw the policy's picture, uint8 [45, 80], of ego car and traffic."""
         return self.rasteriser.frame(cars, ego)
 
     def _outcome(self, ego: Rectangle) -> str | None:
-        """Return "goal" or "off_road" where the ego car, of this footprint, is there."""
+        """Return "goal" or "off_road" if the ego car, with this footprint, is there, else None."""
         raise NotImplementedError
 
     def _reward(self, outcome: str | None) -> float:

@@ -35,12 +35,12 @@ class CongestionConfig(base.ScenarioConfig):
     traffic_speed_mps: base.Range = (4.0, 6.0)  # Initial speeds of traffic (section VI-A)
     jam_speed_mps: base.Range = (4.5, 5.5)  # Speed of the whole jam
     lane_speed_mps: base.Range = (-0.5, 0.5)
-    """Speed of each lane's first car relative to the jam. Lanes that drifted apart at 2 m/s would
-    leave the ego car alone before half of the way."""
+    """Speed of each lane's first car relative to the jam. At 2 m/s the lanes would drift apart, and
+    the ego car would be alone before half of the way."""
     side_cars: int = 3
-    """In each neighbouring lane; with those ahead and behind these are the eight within 20 m."""
+    """Cars in each neighbouring lane; with one ahead and one behind, eight are within 20 m."""
     cars_behind: int = 1
-    """In the ego car's lane; they follow it. Cars in other lanes never react to it."""
+    """Cars that follow the ego car in its lane. Cars in other lanes never react to it."""
     traffic_mix: base.Mix = base.CARS_ONLY
     side_front_m: base.Range = (9.0, 13.0)
     """Distance to each neighbouring lane's first car, centre to centre."""
@@ -98,7 +98,7 @@ def spawn_traffic(
         if lane == EGO_LANE and config.cars_behind:
             own[1].leader = ego
         base.equip(own, types, config.time_gap_factor)
-        # A lane's first car goes with the jam; the others would go faster if they could.
+        # A lane's first car drives at the jam's speed; the others want to go faster.
         own[0].speed = own[0].target_speed = first_mps
         cars += own
     for car in cars:
@@ -163,7 +163,7 @@ class CongestionEnv(base.DrivingEnv):
 
     @property
     def car(self) -> dict[str, float]:
-        """The IDM, not the action, sets the throttle; the action +1 turns right."""
+        """The car for the policy file; the IDM sets the throttle, and action +1 turns right."""
         c = self.config
         return {
             "throttle_mps2": base.CAR.acceleration_mps2,
@@ -175,11 +175,11 @@ class CongestionEnv(base.DrivingEnv):
 
     @property
     def brake_action(self) -> base.Action:
-        """Applied when commands stop: the last steering; ``press_brake`` brakes."""
+        """The last steering, applied when commands stop; ``press_brake`` does the braking."""
         return np.array([self._steering], dtype=np.float32)
 
     def press_brake(self, pressed: bool) -> None:
-        """Full brake instead of the IDM, until released or reset: the simulator's safe stop."""
+        """Brake fully instead of following the IDM, until released or reset: the safe stop."""
         self._braking = pressed
 
     def step(self, action: base.Action) -> base.Step:
@@ -216,7 +216,7 @@ class CongestionEnv(base.DrivingEnv):
         self._braking = False
 
     def _pedals(self) -> float:
-        """The ego car's acceleration in m/s2: the IDM's, or the brake's."""
+        """Return the ego car's acceleration in m/s2: the IDM's, or the brake's."""
         c, leader = self.config, self._leader()
         if self._braking:
             return -c.brake_mps2
@@ -232,11 +232,11 @@ class CongestionEnv(base.DrivingEnv):
         return max(idm, -c.brake_mps2)
 
     def _leader(self) -> base.TrafficVehicle | None:
-        """The nearest vehicle ahead in the ego car's corridor, whatever the lane."""
+        """Return the nearest vehicle ahead in the ego car's corridor, in any lane."""
         x, y = self.ego.position.tolist()
-        room = self.ego.WIDTH
+        width_m = self.ego.WIDTH
         ahead = [car for car in self.traffic if car.position[0] > x
-                 and abs(car.position[1] - y) < 0.5 * (car.WIDTH + room)]  # fmt: skip
+                 and abs(car.position[1] - y) < 0.5 * (car.WIDTH + width_m)]  # fmt: skip
         return min(ahead, key=lambda car: float(car.position[0]), default=None)
 
     def _frame(self, ego: Rectangle, cars: list[Rectangle]) -> NDArray[np.uint8]:

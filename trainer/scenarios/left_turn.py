@@ -15,7 +15,7 @@ from trainer.scenarios.picture import Rasteriser, Rectangle
 LANE_REACH_M = 100.0  # How far the main road goes on to either side
 SIDE_ROAD_M = 40.0
 NEAR_LANE: LaneIndex = ("west", "east", 0)
-"""The lane of the main road that the ego car must cross; the other one it joins."""
+"""The lane of the main road that the ego car must cross; it then joins the far lane."""
 HEADING_GAIN = 1.5
 OFFSET_GAIN_RAD_PER_M = 0.5
 INTEGRAL_GAIN_RAD_PER_MS = 0.1
@@ -81,7 +81,7 @@ class LeftTurnConfig(base.ScenarioConfig):
     turn_radius_m: float = 6.0
     goal_m: float = 21.0  # Path length from start to goal
     stop_line_m: float = 6.0
-    """Place of a waiting car; its nose is then 1.5 m short of the main road."""
+    """Path length of a waiting car; its nose is then 1.5 m short of the main road."""
     ego_speed_mps: base.Range = (3.0, 5.0)  # Initial speed of the ego car
     max_speed_mps: float = 6.0
     throttle_mps2: float = 3.0  # Acceleration at full pedal (+1)
@@ -93,9 +93,9 @@ class LeftTurnConfig(base.ScenarioConfig):
     first_car_m: base.Range = (2.0, 12.0)
     """Distance of the first car before the middle of the crossing: too near to turn before it."""
     short_gap_m: base.Range = (10.0, 16.0)
-    """A gap too short for anybody, centre to centre of cars; longer vehicles keep the room."""
+    """A gap too short to turn, centre to centre of cars; longer vehicles get longer gaps."""
     long_gap_m: base.Range = (32.0, 42.0)  # A gap long enough for a driver who is ready
-    long_gap_share: float = 0.5  # How often a gap is a long one
+    long_gap_share: float = 0.5  # Share of the gaps that are long
     target_speed_mps: float = 5.0  # Target of the reward's speed term (eq. 31).
     speed_weight: float = 0.02
     """Scale of the speed term. With gamma 0.95 and 10 Hz the horizon is 2 s: from the stop line the
@@ -111,7 +111,7 @@ class LeftTurnConfig(base.ScenarioConfig):
 
 SCENES: dict[Scene, LeftTurnConfig] = {
     "nominal": LeftTurnConfig(),
-    # More vehicles may take longer than 20 s to pass; a car that rightly waits shall not time out.
+    # More vehicles may take longer than 20 s to pass; waiting for them must not time out.
     "variant": LeftTurnConfig(traffic_cars=5, traffic_mix=base.MIXED, max_steps=300),
     # A longer queue whose gaps all come from one range, neither clearly long nor clearly short. The
     # scripted expert takes no gap under 16 m and every gap over 25 m; between them the two cars'
@@ -131,7 +131,7 @@ class LeftTurnEnv(base.DrivingEnv):
     action_meanings = ("positive opens the throttle, negative brakes",)
     action_units = ("aperture",)
     keys = MappingProxyType({"up": (1.0,), "w": (1.0,), "down": (-1.0,), "s": (-1.0,)})
-    key_rate_per_s = 5.0  # A pedal is down in 0.2 s.
+    key_rate_per_s = 5.0  # A key presses the pedal fully in 0.2 s.
     biased_action = 1.0  # Full throttle.
     expert_class = "trainer.human.left_turn:LeftTurnHuman"
     scenes = SCENES
@@ -160,7 +160,7 @@ class LeftTurnEnv(base.DrivingEnv):
 
     @property
     def car(self) -> dict[str, float]:
-        """Full steering is the path control's limit: no action of the left turn steers."""
+        """The car for the policy file; full steering is the path control's limit."""
         c = self.config
         return {
             "throttle_mps2": c.throttle_mps2,

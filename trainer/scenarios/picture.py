@@ -1,8 +1,8 @@
 """Pictures of a scene: the 45x80 grey values that the policy sees, and a larger one for people.
 
-Both show oriented rectangles. A pixel of the policy's has the values of the classes that cover it,
-mixed by area: a car that moves by a tenth of a pixel changes the picture, so two frames show speed
-(eq. 28 stacks two). A picture takes tens of microseconds.
+Both show oriented rectangles. A pixel of the policy's picture mixes the values of the classes that
+cover it by area: a car that moves by a tenth of a pixel changes the picture, so two frames show
+speed (eq. 28 stacks two). Drawing takes tens of microseconds.
 """
 
 import math
@@ -44,12 +44,12 @@ def overlap(a: Rectangle, b: Rectangle) -> bool:
         return False
     cos_between = abs(math.cos(b.heading - a.heading))
     sin_between = abs(math.sin(b.heading - a.heading))
-    for one, other in ((a, b), (b, a)):
-        cos, sin = math.cos(one.heading), math.sin(one.heading)
+    for box, other in ((a, b), (b, a)):
+        cos, sin = math.cos(box.heading), math.sin(box.heading)
         along, across = abs(dx * cos + dy * sin), abs(dy * cos - dx * sin)
-        if 2 * along > one.length + other.length * cos_between + other.width * sin_between:
+        if 2 * along > box.length + other.length * cos_between + other.width * sin_between:
             return False
-        if 2 * across > one.width + other.length * sin_between + other.width * cos_between:
+        if 2 * across > box.width + other.length * sin_between + other.width * cos_between:
             return False
     return True
 
@@ -76,7 +76,7 @@ class Rasteriser:
         """The still part of the picture, grey values [45, 80]."""
         for road in roads:
             self.draw(self.background, road, ROAD)
-        # In the type of the sums that they are used in.
+        # float64, as the sums in `_with_traffic` need it.
         self._still = self.background.astype(np.float64)
         self._up_to_traffic = (TRAFFIC - self.background).astype(np.float64)
 
@@ -130,7 +130,7 @@ class Rasteriser:
     def _covered(
         self, offset_m: NDArray[np.floating], side_m: float | NDArray[np.floating]
     ) -> NDArray[np.floating]:
-        """Return how much of a pixel lies between two sides, by its offset from their middle."""
+        """Return the share of a pixel between two sides, by its offset from their middle."""
         share = (0.5 * side_m - np.abs(offset_m)) / self.metres_per_pixel + 0.5
         # np.clip costs more than the arithmetic on arrays this small.
         return np.minimum(np.maximum(share, 0.0), 1.0)
@@ -149,7 +149,7 @@ VIEW = (-30.0, -7.0)
 """Upper left corner of the ground shown, for a scene that names no ``view`` of its own."""
 GOAL_HALF_M = 2.0
 BODY = ("x", "y", "heading_rad", "length_m", "width_m")
-"""A scene's vehicle in the order of a ``Rectangle``."""
+"""Fields of a scene's vehicle in the order of a ``Rectangle``."""
 
 
 def draw_scene(scene: dict[str, Any]) -> NDArray[np.uint8]:
