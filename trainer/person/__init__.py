@@ -1,7 +1,7 @@
-"""A person at the wheel: hands and eyes, their options, and who is in control. Pure but for a lock.
+"""A person at the wheel: inputs, views, options, and who is in control. Pure, but for a lock.
 
-From the hands to the car: ``Seat`` says which page's hands count, ``Intent`` whether the person
-wants control, ``TakeOver`` what the car is told while that changes.
+On the way from a page to the car, ``Seat`` picks the page that drives, ``Intent`` decides whether
+the person wants control, and ``TakeOver`` computes the action while control changes hands.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ PERSON = "person"  # ``RunConfig.human`` of a run that a person guides
 HUMANS = ("web",)
 """Words of ``--human`` for a person; the browser has keyboard, touch, gamepad and wheel."""
 SLOWEST, FASTEST = 0.01, 1000
-"""Simulated seconds in one of the person's."""
-SILENCE_S = 0.5  # A driver who is not heard for this long has let go
+"""Range of ``--speed``, simulated seconds per real second."""
+SILENCE_S = 0.5  # A page that sends nothing for this long has let go
 MAX_SLEW = 0.5
-"""Most change of the action in a control period of a hand-over. From full throttle to full brake
-takes 0.4 s: about what a foot needs from pedal to pedal."""
+"""Maximum change of the action in a control period of a hand-over. From full throttle to full
+brake takes 0.4 s, about as long as a foot needs from pedal to pedal."""
 MOVED = 0.15  # How far from rest a wheel or a pedal must be to take over
 RESTING = 0.05  # Below this it rests; less than MOVED, for a hand that trembles there
 REST_S = 0.6  # How long it must rest to hand control back: a wheel passes its middle in every bend
@@ -66,16 +66,16 @@ class Reading:
     """In [-1, 1]: the pedal in the left turn (1 full throttle, -1 full brake), the steering in the
     congestion (negative to the left)."""
     engaged: bool = False
-    """Whether the person holds what takes over. A lost connection or device is letting go."""
+    """Whether the person holds a key, button or pad that takes over; a lost device lets go."""
     wishes: frozenset[Wish] = frozenset()
-    """What was asked for since the last reading; each press is reported once."""
+    """Wishes since the last reading; each press is reported once."""
     by_moving: bool = False
     """Whether moving ``action`` away from rest also takes over, as with a steering wheel."""
 
 
 @dataclass(frozen=True)
 class View:
-    """What a person sees of one control period."""
+    """One control period as the cockpit shows it."""
 
     scenario: str
     scene: dict[str, Any] | None
@@ -84,7 +84,7 @@ class View:
     frames: NDArray[np.uint8] | None
     """What the policy sees: [2, 45, 80], the older frame first; None: something else."""
     policy_action: Amount | None  # None where the person drives alone
-    human_action: Amount  # What the device says, in control or not
+    human_action: Amount  # The device's action, in control or not
     applied_action: Amount
     control: Control
     speed_mps: float  # nan where the environment does not tell, as ``goal_m``
@@ -96,9 +96,9 @@ class View:
     paused: bool = False
     progress: str = ""  # One line on the learner; empty without one
     message: str = ""
-    """A line for the page, such as "saving" or "episode ended: goal"; mostly empty."""
+    """A line for the page, such as "saving" or "episode ended: goal"; usually empty."""
     picture: NDArray[np.uint8] | None = None
-    """What the environment draws, [height, width, 3], where it has no scene."""
+    """The environment's own picture, [height, width, 3], if it has no scene."""
 
 
 def add_person(parser: argparse.ArgumentParser) -> None:
@@ -114,15 +114,15 @@ def add_person(parser: argparse.ArgumentParser) -> None:
 
 
 class TakeOver:
-    """Decides each control period from what the policy and the person want, for one episode.
+    """Combines the policy's and the person's action in each control period of one episode.
 
-    While control changes hands, the action moves by at most ``MAX_SLEW`` a period towards the new
-    driver's: it never jumps, and begins to move at once.
+    While control changes hands, the action moves towards the new driver's by at most ``MAX_SLEW`` a
+    period: it starts at once and never jumps.
     """
 
     def __init__(self) -> None:
         self.state: Literal["policy", "taking", "human", "returning"] = "policy"
-        self.applied: Amount | None = None  # What the car was told last
+        self.applied: Amount | None = None  # The last action sent to the car
 
     @property
     def control(self) -> Control:
@@ -131,10 +131,10 @@ class TakeOver:
     def step(self, policy_action: Amount, human_action: Amount, holds: bool) -> Intervention | None:
         """Decide one control period; ``holds``: whether the person wants control (``Intent``).
 
-        Every step counts as the person's whose action is not the policy's own.
+        Every step counts as the person's unless its action is the policy's own.
         """
         goal = human_action if holds else policy_action
-        # At an episode's start there is nothing to leave from but the policy's action.
+        # An episode starts from the policy's action.
         last = policy_action if self.applied is None else self.applied
         before, driver = self.state, "human" if holds else "policy"
         if before == driver or distance(goal, last) <= MAX_SLEW:
@@ -155,7 +155,7 @@ def moved(reading: Reading, rest: Amount) -> bool:
 
 
 class Intent:
-    """Decides whether the person wants control: holds something, or has moved the wheel."""
+    """Decides whether the person wants control: holds a control, or has moved the wheel."""
 
     def __init__(self, rest: Amount = 0.0) -> None:
         self._rest = rest
@@ -196,9 +196,9 @@ class Input(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Seat:
     """The pages of a cockpit: the oldest one drives, the others watch.
 
-    A hold, or a wheel that is turned, counts only after the page was heard with its hands off, and
-    after a silence it must be heard so again: a connection that comes back does not take over by
-    itself. The server's thread calls ``sit_down``, ``hear`` and ``get_up``, the loop's ``poll``.
+    A hold, or a turned wheel, counts only after the page has once sent hands off, and after a
+    silence it must send that again: a connection that comes back does not take over by itself. The
+    server's thread calls ``sit_down``, ``hear`` and ``get_up``, the loop's ``poll``.
     """
 
     def __init__(self, rest: Amount = 0.0) -> None:
@@ -206,12 +206,12 @@ class Seat:
         self._lock = threading.Lock()
         self._pages: list[object] = []
         self._wishes: set[Wish] = set()
-        self._said = self._off
+        self._reading = self._off
         self._tap: Reading | None = None
-        """The farthest of what takes over since the last poll, by a button, a wheel or a pedal: a
-        tap shorter than a control period counts for one, also while a button is held."""
-        self._began = False  # A hold has begun since then
-        self._polled = rest  # The action that was said then
+        """The reading since the last poll that takes over and is farthest from rest: a tap shorter
+        than a control period counts as one period, also while a button is held."""
+        self._began = False  # A hold has begun since the last poll
+        self._polled = rest  # Action of the page's reading at the last poll
         self._hands_were_off = False
         self._heard_s = float("-inf")
 
@@ -220,7 +220,7 @@ class Seat:
             self._pages.append(page)
 
     def get_up(self, page: object) -> None:
-        """Remove a page; what its driver wished for still stands."""
+        """Remove a page; its wishes are kept for the next poll."""
         with self._lock:
             if self._pages[:1] == [page]:
                 self._let_go()
@@ -234,7 +234,7 @@ class Seat:
         with self._lock:
             return now_s - self._heard_s <= SILENCE_S
 
-    def hear(self, page: object, said: Input, now_s: float) -> bool:
+    def hear(self, page: object, message: Input, now_s: float) -> bool:
         """Record a page's input; return whether it was accepted."""
         with self._lock:
             if self._pages[:1] != [page]:
@@ -242,36 +242,36 @@ class Seat:
             if now_s - self._heard_s > SILENCE_S:
                 self._let_go()
             self._heard_s = now_s
-            self._wishes |= set(said.wishes)
-            # Nothing is held, and a wheel that takes over by moving is at rest.
-            action = self._rest if said.action is None else said.action
-            resting = not said.by_moving or distance(action, self._rest) <= RESTING
-            self._hands_were_off |= resting and not said.engaged
+            self._wishes |= set(message.wishes)
+            # Hands off: nothing is held, and a wheel that takes over by moving is at rest.
+            action = self._rest if message.action is None else message.action
+            resting = not message.by_moving or distance(action, self._rest) <= RESTING
+            self._hands_were_off |= resting and not message.engaged
             if not self._hands_were_off:
                 return False
-            before, now = self._said, Reading(action, said.engaged, by_moving=said.by_moving)
+            now = Reading(action, message.engaged, by_moving=message.by_moving)
             if self._wants(now):
-                self._began |= not self._wants(before)
+                self._began |= not self._wants(self._reading)
                 taps = (now, self._tap or now)
                 self._tap = max(taps, key=lambda tap: distance(tap.action, self._rest))
-            self._said = now
+            self._reading = now
             return True
 
     def poll(self, now_s: float) -> Reading:
-        """Return what the driver does at ``now_s``; each wish once."""
+        """Return the driver's reading at ``now_s``, with each wish once."""
         with self._lock:
-            said = self._said if now_s - self._heard_s <= SILENCE_S else self._off
-            is_back = said.action == self._polled if self._wants(said) else self._began
-            tap, self._tap, self._began, self._polled = self._tap, None, False, said.action
-            if said is not self._off and tap is not None and is_back:
-                said = tap
+            now = self._reading if now_s - self._heard_s <= SILENCE_S else self._off
+            is_back = now.action == self._polled if self._wants(now) else self._began
+            tap, self._tap, self._began, self._polled = self._tap, None, False, now.action
+            if now is not self._off and tap is not None and is_back:
+                now = tap
             wishes, self._wishes = frozenset(self._wishes), set()
-            return Reading(said.action, said.engaged, wishes, said.by_moving)
+            return Reading(now.action, now.engaged, wishes, now.by_moving)
 
-    def _wants(self, said: Reading) -> bool:
-        return said.engaged or moved(said, self._rest)
+    def _wants(self, reading: Reading) -> bool:
+        return reading.engaged or moved(reading, self._rest)
 
     def _let_go(self) -> None:
-        self._said, self._tap, self._began = self._off, None, False
+        self._reading, self._tap, self._began = self._off, None, False
         self._hands_were_off = False
         self._heard_s = float("-inf")

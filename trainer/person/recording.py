@@ -1,4 +1,4 @@
-"""A sitting's recording: every step, kept from the moment it is taken.
+"""Record a sitting: every step is written as soon as it is driven.
 
 One MCAP file a sitting, whose messages are whole transitions (``RecordedStep``) in MessagePack,
 each in a chunk of its own, handed to the operating system at once: a kill loses one step at most.
@@ -29,7 +29,7 @@ NAME = re.compile(r"sitting-(\d{4,})\.mcap")
 
 
 class RecordedStep(msgspec.Struct, frozen=True):
-    """One control period, whole: a transition, and what each did in it."""
+    """One control period: a transition, and the actions of policy and person."""
 
     sitting: int
     index: int  # The step's number in the sitting, from 0
@@ -37,13 +37,13 @@ class RecordedStep(msgspec.Struct, frozen=True):
     seed: int  # The episode's
     episode: int
     step: int  # In the episode, from 0
-    time_ns: int  # When the hands were asked: wall time, ns since 1970
+    time_ns: int  # When the device was read: wall time, ns since 1970
     time_s: float  # Simulated, since the episode's start
     seen: bytes  # s: what the policy saw, as an .npy file
     seen_next: bytes  # s', likewise
     policy_action: Amount | None
-    human_action: Amount  # What the device said
-    action: Amount  # What was applied
+    human_action: Amount  # The device's action
+    action: Amount  # The applied action
     control: Control
     human: bool  # The mask Delta
     first: bool  # Whether an intervention began here
@@ -53,7 +53,7 @@ class RecordedStep(msgspec.Struct, frozen=True):
     speed_mps: float
     outcome: str = ""  # How the episode ended here, if it did
     ahead: tuple[bytes, ...] = ()
-    """Observations that the policy's action would have led to, if the algorithm foresees."""
+    """Observations predicted for the policy's action, if the algorithm looks ahead."""
 
     @property
     def observation(self) -> NDArray[Any]:
@@ -65,7 +65,7 @@ class RecordedStep(msgspec.Struct, frozen=True):
         return _unpacked(self.seen_next)
 
     def transition(self, penalised: bool = False) -> Transition:
-        """Return what was stored of the step; a learner's penalty is not recorded."""
+        """Return the step's transition; ``penalised`` is given, since the recording lacks it."""
         overruled = None if self.policy_action is None else vector(self.policy_action)
         foreseen = tuple(map(_unpacked, (self.seen, *self.ahead))) if self.ahead else ()
         return Transition(
@@ -98,21 +98,21 @@ class Recorder:
         self._last: RecordedStep | None = None
 
     def add(self, step: RecordedStep) -> None:
-        """Keep a step; an episode's last one waits until it is known whether it is discarded."""
+        """Record a step; hold back an episode's last one until the person may have discarded it."""
         if step.terminated or step.truncated:
             self._last = step
         else:
             self.write(step)
 
     def end_episode(self, outcome: str | None = None) -> None:
-        """Keep the last step of an episode; ``outcome`` None: as the step says. Then do nothing."""
+        """Write an episode's last step, with ``outcome`` unless None; once for each episode."""
         step, self._last = self._last, None
         if step is not None:
             outcome = step.outcome if outcome is None else outcome
             self.write(msgspec.structs.replace(step, outcome=outcome))
 
     def write(self, step: RecordedStep) -> None:
-        """Write a step, which no kill then takes away. OSError on a full disk."""
+        """Write a step, safe from a kill from then on. OSError on a full disk."""
         data, index = msgspec.msgpack.encode(step), self.index
         self.index += 1
         self._mcap.add_message(self._channel, step.time_ns, data, step.time_ns, index)
@@ -131,11 +131,11 @@ class Recorder:
 
 def sittings(directory: Path) -> list[Path]:
     """Return the recordings of a directory in order; none if it does not exist."""
-    found = [path for path in directory.glob("sitting-*.mcap") if NAME.fullmatch(path.name)]
-    return sorted(found, key=_number)
+    paths = [path for path in directory.glob("sitting-*.mcap") if NAME.fullmatch(path.name)]
+    return sorted(paths, key=_number)
 
 
-def _begun(directory: Path) -> list[Path]:
+def _nonempty(directory: Path) -> list[Path]:
     """Return the recordings that hold anything: a power cut may leave an empty file."""
     return [path for path in sittings(directory) if path.stat().st_size > MAGIC_SIZE]
 
@@ -146,29 +146,29 @@ def _number(path: Path) -> int:
 
 def find_recordings(places: Sequence[Path]) -> list[Path]:
     """Return the recordings in files, directories and runs; UserError where a place has none."""
-    found: list[Path] = []
+    recordings: list[Path] = []
     for place in places:
-        here = [place] if place.is_file() else _begun(place) or _begun(place / DIRECTORY)
-        if not here:
+        paths = [place] if place.is_file() else _nonempty(place) or _nonempty(place / DIRECTORY)
+        if not paths:
             raise UserError(f"no recording in {place}: expected sitting-NNNN.mcap, or such files")
-        found += [path for path in here if path not in found]
-    return found
+        recordings += [path for path in paths if path not in recordings]
+    return recordings
 
 
 def read_steps(path: Path) -> Iterator[RecordedStep]:
     """Yield the steps of a recording, up to its end or to where a kill has cut it off.
 
-    An episode that damage has torn is left out: steps are missing, or its end, which says whether
-    the person discarded it. UserError: no such file, or not one of ours.
+    A damaged episode is left out: it lacks steps, or the end that tells whether the person
+    discarded it. UserError: no such file, or not one of ours.
     """
     recording = Recording(path)
     drives = groupby(_steps(recording), key=lambda step: step.index - step.step)
     episodes = [list(drive) for _, drive in drives]
     recording.say_trouble()
     for episode in episodes:
-        follow = [step.step for step in episode] == list(range(len(episode)))
+        complete = [step.step for step in episode] == list(range(len(episode)))
         last = episode[-1]
-        if follow and (last.terminated or last.truncated or episode is episodes[-1]):
+        if complete and (last.terminated or last.truncated or episode is episodes[-1]):
             yield from episode
 
 
@@ -181,7 +181,7 @@ def _steps(recording: Recording) -> Iterator[RecordedStep]:
             raise UserError(f"{path}, with {channel.topic}, is no recording of a sitting; {hint}")
         try:
             yield msgspec.msgpack.decode(message.data, type=RecordedStep)
-        except msgspec.DecodeError as error:  # The chunk's checksum is right: no kill does that.
+        except msgspec.DecodeError as error:  # The chunk's checksum is right, so this is no damage.
             raise UserError(f"{path} was recorded by another version: {error}") from None
 
 
@@ -194,6 +194,6 @@ def read_episodes(steps: Iterable[RecordedStep]) -> Iterator[list[RecordedStep]]
 
 
 def steps_since(directory: Path, position: tuple[int, int]) -> Iterator[RecordedStep]:
-    """Yield the steps from ``position``, a sitting and an index, on, over all sittings."""
-    for path in _begun(directory):
+    """Yield all sittings' steps from ``position`` (sitting, index) on."""
+    for path in _nonempty(directory):
         yield from (step for step in read_steps(path) if (step.sitting, step.index) >= position)

@@ -1,4 +1,4 @@
-"""A training that a person guides: the parts of such a run, and what a kill had taken from it."""
+"""A training guided by a person: set it up, and recover the steps after a kill."""
 
 import argparse
 import copy
@@ -43,9 +43,9 @@ SCRIPTED = (
 def training_with_person(
     arguments: argparse.Namespace, config: RunConfig, run_dir: Path, env: Any, resume: bool
 ) -> Iterator[tuple[TrainingRun, Callable[[], bool]]]:
-    """Open a run with a person as its guide; yield it, and what ends the sitting.
+    """Open a run guided by a person; yield it, and a function that ends the sitting.
 
-    A resumed one stores what was recorded since.
+    A resumed run first stores the steps recorded after its checkpoint.
     """
     check_settings(config)
     with ExitStack() as stack:
@@ -69,7 +69,7 @@ def training_with_person(
 
 
 def _recover(training: TrainingRun, sitting: Sitting) -> None:
-    """Store what was recorded after the checkpoint as if it had just been driven."""
+    """Store the steps recorded after the checkpoint as if they had just been driven."""
     steps = human = 0
     for episode in read_episodes(steps_since(training.run_dir / DIRECTORY, sitting.saved_at)):
         for step in episode:
@@ -82,14 +82,14 @@ def _recover(training: TrainingRun, sitting: Sitting) -> None:
     if steps:
         yours = f"{human} of them yours"
         print(f"{steps} recorded steps after the checkpoint, {yours}, are back", file=sys.stderr)
-    # Episodes that ended after the checkpoint count: the person gave what their rows say.
+    # Episodes that ended after the checkpoint count, since the person's time was spent.
     if ended := read_metrics(training.run_dir)[training.episode :]:
         training.episode += len(ended)
         training.steps = int(ended[-1]["total_steps"])
 
 
 def check_settings(config: RunConfig) -> None:
-    """Refuse what a person cannot be a part of; raises UserError."""
+    """Raise UserError for an algorithm or a setting that does not go with a person."""
     row = find_algorithm(config.algorithm)
     if not row.guided or row.asks:
         raise UserError(f"{config.algorithm} takes no guidance of a person")
@@ -99,7 +99,7 @@ def check_settings(config: RunConfig) -> None:
 
 
 class PersonValidation(Validation):
-    """Validates in a process of its own, and once more at a sitting's end, the page closed."""
+    """Validates in a process of its own, and once more after the sitting, the page closed."""
 
     def __init__(
         self, config: RunConfig, run_dir: Path, learning: LearningThread, sitting: Sitting
@@ -108,10 +108,10 @@ class PersonValidation(Validation):
         self.sitting, self._alone = sitting, ""  # Success of the policy alone, in words
         self._process = ProcessPoolExecutor(1, get_context("spawn"), begin_process, (NICENESS,))
         self._begun: tuple[Actor, int, Future[list[EpisodeResult]]] | None = None
-        """What is being validated, after how many episodes, and its drives to come."""
+        """The actor under validation, the episodes before it, and its future results."""
 
     def after(self, metrics: EpisodeMetrics, episode: int, due: bool, at_end: bool) -> None:
-        """Tell the person what was learned, and validate; a person does not wait for it."""
+        """Show the person the progress, and validate without making the person wait."""
         if not at_end:
             self._beside(metrics, episode, due)
             added, warmup = self.learning.replay.added, self.config.learner.warmup_steps
@@ -124,7 +124,7 @@ class PersonValidation(Validation):
             self.close()
             if every:
                 print("validating; all is saved, ^C leaves it out", file=sys.stderr, flush=True)
-            with sigterm_as_interrupt():  # SIGHUP, too: this episode's row is to be written.
+            with sigterm_as_interrupt():  # Also SIGHUP: this episode's row must be written.
                 super().after(metrics, episode, bool(every), at_end)
         except KeyboardInterrupt:
             with suppress(OSError):  # The terminal may be gone.
@@ -132,26 +132,26 @@ class PersonValidation(Validation):
 
     def close(self) -> None:
         for process in list((self._process._processes or {}).values()):
-            process.kill()  # A person does not wait for it.
+            process.kill()  # The person need not wait for it.
         self._process.shutdown(cancel_futures=True)
 
     def _beside(self, metrics: EpisodeMetrics, episode: int, due: bool) -> None:
-        """Take the validation that is done, into this episode's row, and begin one that is due."""
+        """Enter a finished validation into this episode's row, and start one that is due."""
         if self._begun is not None and self._begun[2].done():
             (actor, then, drives), self._begun = self._begun, None
             if error := drives.exception():
                 print(f"no validation beside the drive: {error}", file=sys.stderr)
             else:
                 self.take(drives.result(), actor, metrics, then)
-                said = f"has a return of {metrics.validation_reward:.1f}"
+                result = f"has a return of {metrics.validation_reward:.1f}"
                 if not math.isnan(metrics.validation_success):
-                    said = f"succeeds in {metrics.validation_success:.0%}"
-                self._alone = f", the policy alone {said}"
+                    result = f"succeeds in {metrics.validation_success:.0%}"
+                self._alone = f", the policy alone {result}"
         if due and metrics.updates and self._begun is None:
             actor = copy.deepcopy(getattr(self.learning.learner, self.config.kept_actor)).cpu()
             # Not as tensors: torch would share their memory with the process.
             weights = {name: value.numpy() for name, value in actor.state_dict().items()}
-            # A process that was killed: stderr has said so.
+            # BrokenExecutor: the process was killed, which stderr has reported.
             with suppress(BrokenExecutor), _without_script():
                 answer = self._process.submit(_validate, self.config, weights, self.best)
                 self._begun = actor, episode, answer
@@ -159,7 +159,7 @@ class PersonValidation(Validation):
 
 @contextmanager
 def _without_script() -> Iterator[None]:
-    """A process that is spawned meanwhile does not run the script again that trains here."""
+    """Keep a process spawned meanwhile from running the training script again."""
     script = sys.modules["__main__"]
     sys.modules["__main__"] = ModuleType("__main__")
     try:
@@ -168,7 +168,7 @@ def _without_script() -> Iterator[None]:
         sys.modules["__main__"] = script
 
 
-_trials = cache(Trials)  # Of the one config
+_trials = cache(Trials)  # Made once: all calls have the same config
 
 
 def _validate(

@@ -33,8 +33,8 @@ JUDGE_S = 3.0  # The same, where the person may say whether it succeeded
 
 
 class Pacer:
-    """Keeps absolute deadlines. A delay of less than a period is caught up; after a longer one the
-    deadlines begin anew: a car that leaps through what was missed cannot be driven.
+    """Waits for absolute deadlines, a period apart. A delay below one period is caught up; after a
+    longer one the deadlines start anew: a car that leaps ahead cannot be driven.
     """
 
     def __init__(self, period_s: float) -> None:
@@ -45,7 +45,7 @@ class Pacer:
         self._deadline_s = time.monotonic() + self.period_s
 
     def wait(self) -> None:
-        # A signal that another thread took does not wake the main thread: it is noticed afterwards.
+        # A signal that another thread received does not wake this sleep; it is handled afterwards.
         while (left_s := self._deadline_s - time.monotonic()) > 0.0:
             time.sleep(left_s)
         if -left_s < self.period_s:
@@ -55,25 +55,25 @@ class Pacer:
 
 
 class Sitting(Guide):
-    """A person as a guide: waits for each control period, asks the hands, and shows what is.
+    """A person as a guide: paces the control periods, reads the device, and shows the scene.
 
-    ``env`` is the environment itself, ``recorder`` where the sitting is kept, ``speed`` simulated
-    seconds in one of the person's.
+    ``env`` is the environment without wrappers, ``recorder`` writes the sitting, ``speed`` is
+    simulated seconds per real second.
     """
 
     def __init__(self, person: web.Cockpit, env: Any, recorder: Recorder, speed: float) -> None:
         self.person, self.env, self.recorder = person, env, recorder
         self.pacer = Pacer(env.control_period_s / speed)
         self.stop = self.closed = False
-        self.episode = 0  # The number of the episode, or of the next one
+        self.episode = 0  # Number of the current or next episode
         self.progress = ""
         self.outcomes = Counter[str]()  # In this sitting
         self.saved_at = 0, 0
-        """Sitting and step up to which the checkpoint knows what was recorded."""
+        """Sitting and step up to which the checkpoint holds the recorded steps."""
         self._paused = False
         self._rest = amount(env.rest_action)
-        self._seen: tuple[Observation, dict[str, Any]] | None = None
-        """What the policy sees, and the info; None before the first episode: nothing to show."""
+        self._newest: tuple[Observation, dict[str, Any]] | None = None
+        """The newest observation and info; None before the first episode."""
         self._forget()
 
     def _forget(self) -> None:
@@ -89,8 +89,8 @@ class Sitting(Guide):
         self._judged = ""  # The person's word on how the episode ended
 
     def begin(self, seed: int, observation: Observation, info: dict[str, Any]) -> None:
-        """Start an episode as soon as the person is there; GuideGone where the person quits."""
-        self._seed, self._seen = seed, (observation, info)
+        """Start an episode once the person is present; GuideGone if the person quits."""
+        self._seed, self._newest = seed, (observation, info)
         self._forget()
         while not self.person.present and not self.stop:
             self._idle("waiting for the person's device")
@@ -102,10 +102,10 @@ class Sitting(Guide):
     def watch(
         self, observation: Observation, policy_action: Action | None, doubt: float = 0.0
     ) -> Intervention | None:
-        """Show the scene, wait for the control period, and read the hands as late as possible.
+        """Show the scene, wait for the control period, and read the device as late as possible.
 
         ``policy_action`` is None where the person drives alone. In a hand-over the action is
-        neither the person's nor the policy's; the replay buffer takes it for the person's.
+        between the person's and the policy's; the replay buffer stores it as the person's.
         """
         self._policy_action = None if policy_action is None else amount(policy_action)
         self.show()
@@ -118,25 +118,25 @@ class Sitting(Guide):
         if self._policy_action is not None:
             holds = self._intent.update(self._reading, time.monotonic())
             self._intervention = self._take_over.step(self._policy_action, hands, holds)
-            assert self._take_over.applied is not None  # It has just decided.
+            assert self._take_over.applied is not None  # Set by step
             self.applied = self._take_over.applied
             self._control = self._take_over.control
         elif self.person.present:
             self._intervention = Intervention(vector(hands), BY_PERSON, first=before is None)
             self.applied, self._control = hands, "human"
-        else:  # The car rolls, and that demonstrates nothing.
+        else:  # Nobody drives: the car rolls, which is no demonstration.
             self._intervention, self.applied, self._control = None, self._rest, "policy"
         self._moment = {**self._now(), "time_ns": self._read_ns}
         return self._intervention
 
     def moved(self, observation: Observation, info: dict[str, Any]) -> str:
-        """Take what a step has led to; return how the person ends the episode, else nothing."""
-        self._seen = observation, info
+        """Take a step's result; return the outcome if the person ends the episode, else ''."""
+        self._newest = observation, info
         self._step += 1
         return (STOPPED if self.stop else RESTARTED) if self._to_end else ""
 
     def record(self, transition: Transition, _: Any, info: dict[str, Any]) -> None:
-        """Keep a control period: the transition, and what the person did."""
+        """Record a control period: the transition and the person's part."""
         self.recorder.add(
             RecordedStep(
                 **self._moment,
@@ -157,15 +157,15 @@ class Sitting(Guide):
         )
 
     def end_episode(self, outcome: str) -> str:
-        """Show how the episode ended, which the person may still discard; return how it ended."""
-        open_to_say = outcome in (UNKNOWN, TRUNCATED)
-        rest_s = JUDGE_S if open_to_say else REST_S
-        # Counted in periods: on a machine that stands still, too, the person is asked.
+        """Show the outcome for a moment, in which the person may discard or judge; return it."""
+        is_open = outcome in (UNKNOWN, TRUNCATED)
+        rest_s = JUDGE_S if is_open else REST_S
+        # Counted in periods, so that a machine that stalls still lets the person answer.
         for _ in range(math.ceil(rest_s / self.env.control_period_s)):
-            if self.stop or (self._judged and open_to_say):
+            if self.stop or (self._judged and is_open):
                 break
             self._idle("episode discarded" if self._discard else f"episode ended: {outcome}")
-            if self._discard:  # Written at once: no kill shall take that back.
+            if self._discard:  # Written at once, so that a kill does not lose it.
                 self.recorder.end_episode(DISCARDED)
         if outcome in UNTOLD:
             outcome = self._judged or outcome
@@ -176,16 +176,16 @@ class Sitting(Guide):
         return outcome
 
     def show(self, message: str = "") -> None:
-        """Show the scene, and a line about what happens besides driving."""
-        if self._seen is None or self.closed:
+        """Show the scene, with a line of text."""
+        if self._newest is None or self.closed:
             return
-        frames, info = self._seen
+        observation, info = self._newest
         scene = self.env.scene()
         view = View(
             **self._now(),
             scene=scene,
             picture=self.env.render() if scene is None else None,
-            frames=frames if self.env.layout.stacked else None,
+            frames=observation if self.env.layout.stacked else None,
             applied_action=self.applied,
             distance_m=float(info["distance_m"]),
             goal_m=float(self.env.goal_m),
@@ -227,8 +227,8 @@ class Sitting(Guide):
         return self.stop or self._restart or self._discard
 
     def _now(self) -> dict[str, Any]:
-        """Return what a view and a recorded step both say of the control period."""
-        assert self._seen is not None
+        """Return the fields of the control period that views and recorded steps share."""
+        assert self._newest is not None
         return {
             "scenario": self.env.scenario,
             "episode": self.episode,
@@ -237,7 +237,7 @@ class Sitting(Guide):
             "policy_action": self._policy_action,
             "human_action": self._reading.action,
             "control": self._control,
-            "speed_mps": float(self._seen[1]["speed_mps"]),
+            "speed_mps": float(self._newest[1]["speed_mps"]),
         }
 
     def _read(self) -> None:
@@ -280,7 +280,7 @@ class PacedEnvironment:
 
 
 class SharedWheel(Driver):
-    """Drives as a policy, or nobody, does with the person beside it."""
+    """A driver shared by a policy, if any, and the person who may take over."""
 
     def __init__(self, sitting: Sitting, policy: Driver | None) -> None:
         self.sitting, self.policy = sitting, policy
@@ -336,17 +336,17 @@ def drive(
         drive_episodes(vehicle, driver, seeds(), on_episode=ended, recorders=[sitting.record])
 
 
-def _environment(asked: argparse.Namespace) -> tuple[Any, Callable[[int], int]]:
-    """Make what is driven: episodes that are others in every sitting, or one recorded drive's."""
-    if asked.recording is None:
-        if asked.at or asked.episode is not None or asked.vehicle_id:
+def _environment(options: argparse.Namespace) -> tuple[Any, Callable[[int], int]]:
+    """Make the environment and its seeds: new ones in every sitting, or a recorded drive's."""
+    if options.recording is None:
+        if options.at or options.episode is not None or options.vehicle_id:
             raise UserError("--at, --episode and --vehicle-id need a recording: --from F.mcap")
-        seed_of = partial(episode_seed, asked.seed, Purpose.SITTINGS)
-        period_s = asked.policy and trained_in(asked.policy, asked.public_key)[1]
-        return make_environment(asked.scenario or "left_turn", period_s=period_s), seed_of
-    recorded, step = find_fork(asked.recording, asked)
-    own = recorded.environment(asked.scenario, "--scenario")
-    name = scenario_of(asked.scenario or recorded.origin.environment)
+        seed_of = partial(episode_seed, options.seed, Purpose.SITTINGS)
+        period_s = options.policy and trained_in(options.policy, options.public_key)[1]
+        return make_environment(options.scenario or "left_turn", period_s=period_s), seed_of
+    recorded, step = find_fork(options.recording, options)
+    own = recorded.environment(options.scenario, "--scenario")
+    name = scenario_of(options.scenario or recorded.origin.environment)
     is_ours = name in SCENARIOS
     env: Any = ForkedEnvironment(own.unwrapped if is_ours else own, recorded, step)
     env.control_period_s = recorded.task.control_period_s

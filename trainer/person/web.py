@@ -37,7 +37,7 @@ MAX_INPUT_BYTES = 1024  # Of a page's message, which is half as long with 16 act
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 EVERYWHERE = ("0.0.0.0", "::")
 SOMEWHERE = ("192.0.2.1", 9)  # RFC 5737: no machine has this address
-GONE_S = 2.0  # A page that is not heard for this long is disconnected, and the next one may drive
+GONE_S = 2.0  # A page that sends nothing for this long is disconnected; the next may drive
 CLOSING_S = 0.5  # How long a page may take to say good-bye
 VIEWS_UNDERWAY = 2
 """Views sent before the page says that it has drawn one: a slow page gets fewer, never old ones."""
@@ -48,7 +48,7 @@ HEADERS = {
     "X-Content-Type-Options": "nosniff",
 }
 """The address holds the token: no browser may keep it, pass it on, or frame the page."""
-RESERVED = {"p", "r", "q", "escape", "backspace", "space"}  # Of the wishes and of Space
+RESERVED = {"p", "r", "q", "escape", "backspace", "space"}  # Keys of the wishes, and Space
 INPUT = msgspec.json.Decoder(Input)
 _ENCODER = msgspec.json.Encoder(enc_hook=plain)
 
@@ -73,7 +73,7 @@ def controls_of(env: Any) -> Controls:
         for name, held in env.keys.items()
     }
     if taken := ", ".join(sorted(RESERVED & keys.keys())):
-        raise UserError(f"{env.scenario} is driven with {taken}, which are the cockpit's")
+        raise UserError(f"{env.scenario} uses the keys {taken}, which the cockpit reserves")
     return Controls(keys, amount(env.rest_action), env.key_rate_per_s, tuple(env.action_names))
 
 
@@ -86,7 +86,7 @@ def open_cockpit(arguments: argparse.Namespace, env: Any) -> Cockpit:
         print(f"warning: --host {host}: {danger}", file=sys.stderr)
     print(f"cockpit: open {cockpit.url}", flush=True)
     if has_display():
-        url = cockpit.one_time_url()  # In a thread, for it waits for some browsers.
+        url = cockpit.one_time_url()  # In a thread, since some browsers block.
         threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
     return cockpit
 
@@ -101,7 +101,7 @@ class Page:
 
 
 class Cockpit:
-    """A person in a browser: hands to ask, eyes to show views to.
+    """Serves the browser: reads the person's device and shows views.
 
     The loop's thread calls the public methods, once a control period; none blocks. All else runs in
     the server's thread. Raises UserError where the address cannot be listened on.
@@ -132,24 +132,24 @@ class Cockpit:
 
     @property
     def present(self) -> bool:
-        """Whether a browser has the wheel: an episode waits for it."""
+        """Whether a page drives; an episode waits for one."""
         return self.seat.is_heard(time.monotonic())
 
     def poll(self, now_s: float) -> Reading:
-        """Return the hands at ``now_s`` (``time.monotonic``); at rest without a browser."""
+        """Return the reading at ``now_s`` (``time.monotonic``); hands off without a browser."""
         return self.seat.poll(now_s)
 
     def show(self, view: View) -> None:
         self._tell(self._take_view, view)
 
     def close(self) -> None:
-        """Tell the pages that it is over, and end the thread; a second call does nothing."""
+        """Tell the pages that the sitting is over, end the thread; a second call does nothing."""
         self._tell(self._closing.set)
         self._thread.join(4 * CLOSING_S)
 
     def _tell(self, function: Callable[..., object], *arguments: object) -> None:
-        """Call something in the server's thread; nothing once that is closed."""
-        with contextlib.suppress(RuntimeError):  # Closed, perhaps this very moment.
+        """Call a function in the server's thread; do nothing once that is closed."""
+        with contextlib.suppress(RuntimeError):  # The loop is closed.
             self._loop.call_soon_threadsafe(function, *arguments)
 
     def _serve(self) -> None:
@@ -227,16 +227,16 @@ class Cockpit:
         self.seat.sit_down(page)
         sender = asyncio.create_task(self._send_views(page))
         try:
-            why = await self._hear(page)
-        finally:  # Before the good-byes, which take their time.
+            close_code = await self._hear(page)
+        finally:  # Before the close, which takes time.
             self.seat.get_up(page)
             self._pages.remove(page)
             sender.cancel()
-        await socket.close(code=why)
+        await socket.close(code=close_code)
         return socket
 
     async def _hear(self, page: Page) -> WSCloseCode:
-        """Hear a page until it goes, falls silent, or sends what no page of ours sends."""
+        """Read a page's messages until it leaves, falls silent, or sends an invalid one."""
         while True:
             try:
                 message = await page.socket.receive(timeout=GONE_S)
@@ -245,24 +245,24 @@ class Cockpit:
             if message.type is not WSMsgType.TEXT:
                 return WSCloseCode.UNSUPPORTED_DATA
             try:
-                said = INPUT.decode(message.data)
+                sent = INPUT.decode(message.data)
             except msgspec.MsgspecError:
                 return WSCloseCode.POLICY_VIOLATION
-            if said.action is not None and np.shape(said.action) != np.shape(self.controls.rest):
+            if sent.action is not None and np.shape(sent.action) != np.shape(self.controls.rest):
                 return WSCloseCode.POLICY_VIOLATION
-            counts = self.seat.hear(page, said, time.monotonic())
-            page.seen = min(max(page.seen, said.seen), page.sent)
+            accepted = self.seat.hear(page, sent, time.monotonic())
+            page.seen = min(max(page.seen, sent.seen), page.sent)
             page.wake.set()
             driving = self.seat.is_driver(page)
-            refused = driving and not counts  # The hands must be off once.
-            echo = _encode("echo", at_ms=said.at_ms, driving=driving, refused=refused)
+            refused = driving and not accepted  # The hands must be off once.
+            echo = _encode("echo", at_ms=sent.at_ms, driving=driving, refused=refused)
             try:
                 await page.socket.send_str(echo)
             except ConnectionError:
                 return WSCloseCode.GOING_AWAY  # The connection was cut while the page spoke.
 
     async def _send_views(self, page: Page) -> None:
-        """Show the page the newest view, until it is gone, which `_hear` notices."""
+        """Send the page the newest view whenever it has room; `_hear` ends this task."""
         page.wake.set()
         with contextlib.suppress(ConnectionError):
             while await page.wake.wait():
@@ -275,9 +275,9 @@ class Cockpit:
 
 def _listen(host: str, port: int) -> socket.socket:
     try:
-        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-        return socket.create_server(found[0][4], family=found[0][0])
-    except (OSError, OverflowError, UnicodeError) as error:  # The last: no name for DNS.
+        addresses = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        return socket.create_server(addresses[0][4], family=addresses[0][0])
+    except (OSError, OverflowError, UnicodeError) as error:  # UnicodeError: an invalid DNS name.
         raise UserError(f"the cockpit cannot listen on {host} port {port}: {error}") from error
 
 
@@ -306,10 +306,10 @@ async def _say_goodbye(socket: web.WebSocketResponse) -> None:
 
 
 def lan_address(host: str) -> str:
-    """Return this machine's address for others: of the route to the internet; nothing is sent."""
+    """Return this machine's address on its route to the internet; nothing is sent."""
     if host not in EVERYWHERE:
         return host
     with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.connect(SOMEWHERE)
         return str(probe.getsockname()[0])
-    return socket.gethostname()  # There is no such way.
+    return socket.gethostname()  # No route
