@@ -1,4 +1,4 @@
-"""Trains policies with human guidance. The commands are ``python -m trainer``; in Python it is::
+"""Train policies with human guidance: on the command line ``python -m trainer``; in Python::
 
     from trainer import train, evaluate, export, load
 
@@ -7,7 +7,7 @@
     export(run, "my.onnx", key="keys/policy.key")
     action = load("my.onnx").act(observation)
 
-Nothing is imported before it is asked for: torch takes two seconds.
+Each name is imported at its first use: torch takes two seconds to load.
 """
 
 from importlib import import_module
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from trainer.training.command import Run, train
 
 __all__ = ["Evaluation", "Export", "Run", "evaluate", "export", "load", "train"]
-_PLACES = {
+_MODULES = {
     **dict.fromkeys(("Run", "train"), "trainer.training.command"),
     **dict.fromkeys(("Evaluation", "evaluate", "load"), "trainer.evaluation"),
     **dict.fromkeys(("Export", "export"), "trainer.policy_file"),
@@ -27,6 +27,6 @@ _PLACES = {
 
 
 def __getattr__(name: str) -> Any:
-    if name in _PLACES:
-        return getattr(import_module(_PLACES[name]), name)
+    if name in _MODULES:
+        return getattr(import_module(_MODULES[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,6 +1,6 @@
-"""``python -m trainer``: its commands, their options, and where what runs them is.
+"""``python -m trainer``: its commands, their options, and the function that runs each.
 
-That loads torch, matplotlib or rerun, which take seconds; ``--help`` need not wait for them.
+The function is imported only when it runs: torch, matplotlib and rerun take seconds to load.
 """
 
 import argparse
@@ -60,7 +60,7 @@ def train(parser: argparse.ArgumentParser) -> None:
     add(
         "--period", action=_Set, dest="set", default=[], metavar="SECONDS",
         type=lambda text: f"period_s={cli.positive_number(text)}",
-        help="seconds of one step (default: the environment's own; else 1 / render_fps; else"
+        help="control period, s (default: the environment's own; else 1 / render_fps; else"
         f" {PERIOD_S})",
     )  # fmt: skip
     add_latency(what, "simulated network in training and validation")
@@ -76,7 +76,7 @@ def train(parser: argparse.ArgumentParser) -> None:
     add_device(how)
     add_threads(how)
     for action in parser._actions:
-        if action.dest in TYPED:  # Only what is typed wins over a run's own config.
+        if action.dest in TYPED:  # Only typed options override the config of a resumed run.
             action.help = f"{action.help} (default: {action.default})"
             action.default = argparse.SUPPRESS
 
@@ -84,10 +84,10 @@ def train(parser: argparse.ArgumentParser) -> None:
 def seeds(text: str) -> range:
     """Read ``1-5`` or a single number."""
     first, _, last = text.partition("-")
-    found = range(int(first), int(last or first) + 1)
-    if not found:
+    numbers = range(int(first), int(last or first) + 1)
+    if not numbers:
         raise ValueError(text)
-    return found
+    return numbers
 
 
 class _Set(argparse.Action):
@@ -95,9 +95,9 @@ class _Set(argparse.Action):
 
     def __call__(self, parser: Any, namespace: Any, value: Any, option: str | None = None) -> None:
         if value is None:
-            said = meanings(RunConfig) | meanings(LearnerConfig)
+            texts = meanings(RunConfig) | meanings(LearnerConfig)
             for name, default in SETTINGS.items():
-                print(f"{f'{name}={default}':<35} {said.get(name, '')}")
+                print(f"{f'{name}={default}':<35} {texts.get(name, '')}")
             parser.exit()
         setattr(namespace, self.dest, [*getattr(namespace, self.dest), value])
 
@@ -248,30 +248,30 @@ def plot(parser: argparse.ArgumentParser) -> None:
 
 
 def add_scenario(parser: Group, known: str = "") -> None:
-    """Add ``--scenario``; ``known`` says in words where it comes from if not given."""
-    what = (
+    """Add ``--scenario``; ``known`` describes a default that is not ``left_turn``."""
+    text = (
         f"environment: {', '.join(scenarios())}, a gymnasium id such as Pendulum-v1, or MODULE:ID "
     )
-    what += "(MODULE is imported first)"
-    what += f" (default: {known}, else left_turn)" if known else ""
+    text += "(MODULE is imported first)"
+    text += f" (default: {known}, else left_turn)" if known else ""
     default = None if known else "left_turn"
-    parser.add_argument("--scenario", default=default, metavar="NAME", help=what)
+    parser.add_argument("--scenario", default=default, metavar="NAME", help=text)
 
 
 def add_seed(parser: Group, what: str = "") -> None:
-    said = f"random seed{what}"
-    parser.add_argument("--seed", type=cli.not_negative, default=0, metavar="N", help=said)
+    text = f"random seed{what}"
+    parser.add_argument("--seed", type=cli.not_negative, default=0, metavar="N", help=text)
 
 
 def add_threads(parser: Group) -> None:
-    said = "processor threads for PyTorch; 0: PyTorch decides"
+    text = "processor threads for PyTorch; 0: PyTorch decides"
     kind = cli.whole_number(0, MOST_THREADS)
-    parser.add_argument("--threads", type=kind, default=0, metavar="N", help=said)
+    parser.add_argument("--threads", type=kind, default=0, metavar="N", help=text)
 
 
 def add_latency(parser: Group, what: str) -> None:
-    said = f"{what}, for example {SHORT_GRAMMAR}".replace("%", "%%")
-    parser.add_argument("--latency", metavar="SPEC", default="none", help=said)
+    text = f"{what}, for example {SHORT_GRAMMAR}".replace("%", "%%")
+    parser.add_argument("--latency", metavar="SPEC", default="none", help=text)
 
 
 def add_time_limit(parser: Group, what: str) -> None:
@@ -280,35 +280,35 @@ def add_time_limit(parser: Group, what: str) -> None:
 
 
 def add_fields(parser: Group, config: Any, **metavars: str) -> None:
-    """Add an option for each named field of a config, which itself checks the ranges."""
-    said = meanings(type(config))
+    """Add an option for each named field of a config; the config checks the ranges."""
+    texts = meanings(type(config))
     for name, metavar in metavars.items():
         option, default = f"--{name.replace('_', '-')}", getattr(config, name)
         kind = cli.not_negative if isinstance(default, int) else str
         how: dict[str, Any] = {"type": kind, "default": default, "metavar": metavar}
         if isinstance(default, bool):
             how = {"action": "store_true"}
-        parser.add_argument(option, help=said[name].removeprefix("whether "), **how)
+        parser.add_argument(option, help=texts[name].removeprefix("whether "), **how)
 
 
 def meanings(config: type) -> dict[str, str]:
     """Return the first sentence of each field's docstring, by the field's name."""
-    (made,) = ast.parse(inspect.getsource(config)).body
-    assert isinstance(made, ast.ClassDef)
-    found = {}
-    for field, text in pairwise(made.body):
+    (definition,) = ast.parse(inspect.getsource(config)).body
+    assert isinstance(definition, ast.ClassDef)
+    texts = {}
+    for field, text in pairwise(definition.body):
         if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
             assert isinstance(field.target, ast.Name)
             docstring = " ".join(ast.literal_eval(text.value).replace("``", "").split())
             sentence = re.split(r"\. (?=[A-Z(])|\.$", docstring)[0]
             is_word = sentence[1:2].islower() or sentence[1:2] == " "
-            found[field.target.id] = sentence[0].lower() + sentence[1:] if is_word else sentence
-    return found
+            texts[field.target.id] = sentence[0].lower() + sentence[1:] if is_word else sentence
+    return texts
 
 
 def add_device(parser: Group) -> None:
-    said = "device of the neural networks"
-    parser.add_argument("--device", choices=DEVICES, default=DEVICES[0], help=said)
+    text = "device of the neural networks"
+    parser.add_argument("--device", choices=DEVICES, default=DEVICES[0], help=text)
 
 
 COMMANDS: dict[str, tuple[Subcommand, str]] = {

@@ -43,7 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def measure(device: str = "cpu", batch_size: int = LearnerConfig.batch_size) -> dict[str, Any]:
-    """Return the report: machine and versions, the contract's three figures, and a GPU's own."""
+    """Return the report: machine, versions, the contract's three figures, and those of a GPU."""
     learner = LearnerConfig(batch_size=batch_size, warmup_steps=batch_size)
     config = RunConfig(evaluate_every_steps=0, learner=learner, device=device)
     with (
@@ -75,13 +75,13 @@ def measure(device: str = "cpu", batch_size: int = LearnerConfig.batch_size) -> 
 
 
 def in_turn(contenders: dict[str, Callable[[], int]]) -> dict[str, float]:
-    """Return each contender's median seconds for a piece; it returns how many it has done."""
+    """Call contenders by turns; return median seconds per piece. A call returns its pieces."""
     times: dict[str, list[float]] = {name: [] for name in contenders}
     for _ in range(1 + ROUNDS):
         for name, work in contenders.items():
-            began_s = time.perf_counter()
+            start_s = time.perf_counter()
             pieces = work()
-            times[name].append((time.perf_counter() - began_s) / pieces)
+            times[name].append((time.perf_counter() - start_s) / pieces)
     return {name: float(np.median(each[1:])) for name, each in times.items()}
 
 
@@ -96,7 +96,7 @@ def median_s(work: Callable[[], object], pieces: int) -> float:
 
 
 def whole_update(learning: LearningThread) -> Callable[[], None]:
-    """Return an update of PHIL-TD3 on what was driven: drawing, learning, new priorities."""
+    """Return a function that does one update: draw a minibatch, learn, store new priorities."""
     random, replay = np.random.default_rng(0), learning.replay
 
     def update() -> None:
@@ -108,7 +108,7 @@ def whole_update(learning: LearningThread) -> Callable[[], None]:
 
 
 def steps_of(scenario: str) -> Callable[[], None]:
-    """Return a step of a scenario, with its observation, under random actions."""
+    """Return a function that drives one step of a scenario with a random action."""
     env, random, seeds = make_environment(scenario), np.random.default_rng(0), count()
     env.reset(seed=next(seeds))
 
@@ -121,25 +121,25 @@ def steps_of(scenario: str) -> Callable[[], None]:
 
 
 def measure_training(run: TrainingRun) -> dict[str, float]:
-    """Train with an update a step, without validation or checkpoint.
+    """Train with one update per step, without validation or checkpoint.
 
-    Returns seconds for 10,000 steps, scaled up: the wall-clock total, and its parts.
+    Returns seconds for 10,000 steps, extrapolated: the wall-clock total and its parts.
     """
     while run.learning.replay.added < run.config.learner.warmup_steps:
         run.advance()
     began_s = time.perf_counter()
-    driven = [run.advance() for _ in range(ROUNDS // 2)]
+    episodes = [run.advance() for _ in range(ROUNDS // 2)]
     seconds = {"total": time.perf_counter() - began_s}
-    seconds |= {name: sum(getattr(each, f"{name}_s") for each in driven) for name in PARTS}
-    steps = sum(each.steps for each in driven)
+    seconds |= {name: sum(getattr(each, f"{name}_s") for each in episodes) for name in PARTS}
+    steps = sum(each.steps for each in episodes)
     return {name: 1e4 / steps * value for name, value in seconds.items()}
 
 
 def on_a_gpu(run: TrainingRun) -> dict[str, Any]:
-    """Measure an update and a training step, ours and Stable-Baselines3's, and a replay alone, ms.
+    """Measure our and Stable-Baselines3's update and training step, and a graph replay alone, ms.
 
-    Theirs has the networks of tables A2 and A3 and does less: the critics share one trunk, replay
-    is uniform, and there is neither Q advantage nor cloning.
+    Stable-Baselines3 gets the networks of tables A2 and A3 and does less: its critics share one
+    trunk, its replay is uniform, and it has neither Q advantage nor cloning.
     """
     model, (recorded,) = stable_baselines3(run.config), run.learning.learner.recorded.values()
 

@@ -30,8 +30,8 @@ from trainer.util import PERIOD_S
 
 COMMAND_NOISE = 0.05 * 2.0
 """Standard deviation of the noise condition: 5 % of the whole control domain (section VII-D)."""
-MOST_STEPS = 1000  # Of an episode whose environment has no limit of its own
-BEARABLE = 1e4  # Largest number in an observation; the layers of a network take some units
+MOST_STEPS = 1000  # Episode limit where the environment has none
+BEARABLE = 1e4  # Larger observed numbers get a warning: networks learn from numbers near 1
 
 
 Judge = Callable[[Any, Mapping[str, Any], float], bool | None]
@@ -63,21 +63,21 @@ def make_environment(
     period_s: float | None = None,
     success: str = "",
 ) -> Any:
-    """Make the environment of a scenario's word, a gymnasium id or ``module:id``; UserError.
+    """Make an environment by its name: one of our scenarios, a gymnasium id or ``module:id``.
 
-    The two scenarios come as they are, in the scene of a test condition; any other is `Adapted`.
-    With ``printed_reward`` a scenario pays what eq. 31 or 32 says, without its own weight. A step
-    lasts ``period_s``, else what the environment says, else 0.1 s, which a line says. ``success``
-    is a ``module:function`` that judges the episodes of one that does not.
+    Our scenarios come unwrapped, in the scene of a test condition; any other is `Adapted`. With
+    ``printed_reward`` they use eq. 31 or 32 as printed, without their own weight. The control
+    period is ``period_s``, else the environment's, else 0.1 s, with a notice. ``success`` is a
+    ``module:function`` that judges episodes where the environment does not. Raises UserError.
     """
     name, scene = scenario_of(name), CONDITIONS[condition].scene
     if name not in SCENARIOS:
         if printed_reward:
-            raise UserError(f"printed_reward is the paper's, and {name} is none of its scenarios")
+            raise UserError(f"printed_reward is for the paper's scenarios, not for {name}")
         judge = load_named(success, "function") if success else None
         return Adapted(bridge.make_environment(name, scene), name, period_s, judge)
     if success:
-        raise UserError(f"{name} itself says whether an episode succeeded")
+        raise UserError(f"success is not for {name}: the scenario reports it itself")
     scenario: Any = gymnasium.make(SCENARIOS[name], scene=scene).unwrapped
     if printed_reward:
         scenario.config = scenario.config.with_printed_reward()
@@ -86,19 +86,19 @@ def make_environment(
 
 
 def scenario_of(name: str) -> str:
-    """Return the word of a scenario that is named by its id; any other name unchanged."""
-    words = {environment_id: word for word, environment_id in SCENARIOS.items()}
-    return words.get(name.rpartition(":")[2], name)
+    """Return the short name of a scenario given by its gymnasium id; any other name unchanged."""
+    short_names = {environment_id: short for short, environment_id in SCENARIOS.items()}
+    return short_names.get(name.rpartition(":")[2], name)
 
 
 def check_trained_in(env: Any, policy: Path, scenario: str) -> None:
-    """Raise UserError if a policy is of another environment; no file decides what is made."""
+    """Raise UserError unless a policy was trained in this environment; no file selects it."""
     if scenario != env.scenario:
         raise UserError(f"{policy} was trained in {scenario}, not in {env.scenario}")
 
 
 def entries_of(observations: NDArray[Any], plain: str) -> dict[str, NDArray[Any]]:
-    """Return observations as the entries that a policy file names; a single one is ``plain``."""
+    """Return observations by the entry names of a policy file; a single entry is ``plain``."""
     names = observations.dtype.names
     return {name: observations[name] for name in names} if names else {plain: observations}
 
@@ -109,41 +109,41 @@ def own_environment(env: Any) -> Any:
 
 
 def task_of(env: Any) -> Task:
-    """Return what the environment asks of a policy file."""
+    """Return the task that a policy file for the environment must have."""
     return bridge.describe(own_environment(env), env.control_period_s)
 
 
 def foresee(env: Any, observation: Any, action: Action, steps: int) -> list[Any]:
-    """Return the observation and those of ``steps`` steps with the action held.
+    """Return this observation and the next ``steps`` ones if the action were held.
 
-    A copy of the environment takes the steps; fewer where the episode ends.
+    A copy of the environment takes the steps; the list ends early where the episode ends.
     """
-    seen, ahead = [observation], copy.deepcopy(env)
+    observations, ahead = [observation], copy.deepcopy(env)
     for _ in range(steps):
         observation, _, terminated, truncated, _ = ahead.step(action)
-        seen.append(observation)
+        observations.append(observation)
         if terminated or truncated:
             break
-    return seen
+    return observations
 
 
 def check_foresight(env: Any) -> None:
     """Raise UserError unless the environment can be deep-copied for look-ahead."""
     try:
         copy.deepcopy(env)
-    except Exception as error:  # Of any class of an environment
-        raise UserError(f"a copy of {env.scenario} cannot look ahead: {error!r}") from error
+    except Exception as error:  # An environment's own code may raise anything.
+        raise UserError(f"{env.scenario} cannot be copied to look ahead: {error!r}") from error
 
 
 def expert_of(env: Any, human: str = "expert") -> Expert:
-    """Return the environment's scripted expert, or another, ``module:Class``; UserError: none."""
+    """Make the environment's scripted expert, or a ``module:Class``; UserError if there is none."""
     if ":" not in human:
         if env.expert is None:
             raise UserError(f"{env.scenario} offers no expert(); name one as module:Class")
         return env.expert()
-    made = load_named(human, "expert")
+    expert_class = load_named(human, "expert")
     try:
-        return _ScaledExpert(env, made(env.unwrapped))
+        return _ScaledExpert(env, expert_class(env.unwrapped))
     except Exception as error:  # It may raise anything
         raise UserError(f"no expert {human!r}: {type(error).__name__}: {error}") from error
 
@@ -162,10 +162,10 @@ def inner(action_range: tuple[Any, Any], action: Any) -> Action:
 
 
 class Adapted(bridge.Adapter):
-    """Any environment in the form of the two scenarios.
+    """Gives any environment the interface of our two scenarios.
 
-    It was made by the ``name``; ``judge`` says at an episode's end whether it succeeded. Raises
-    UserError for what `bridge.environments.describe` refuses.
+    ``name`` is the name it was made by; ``judge`` decides at an episode's end whether it
+    succeeded. Raises UserError for spaces that `bridge.environments.describe` refuses.
     """
 
     goal_m = float("nan")
@@ -195,7 +195,7 @@ class Adapted(bridge.Adapter):
         self.expert = own and (lambda: _ScaledExpert(self, own()))
         self.can_be_seen = bridge.draws(env) or callable(bridge.offered(env, "scene"))
         if env.spec is None or env.spec.max_episode_steps is None:
-            bridge.say_once(f"{name} has no limit of its own: {MOST_STEPS} steps are taken")
+            bridge.say_once(f"{name} has no step limit: episodes end after {MOST_STEPS} steps")
             self.env = gymnasium.wrappers.TimeLimit(env, MOST_STEPS)
 
     def reset(
@@ -204,23 +204,24 @@ class Adapted(bridge.Adapter):
         """Begin an episode."""
         self._last_action, self._return = self.rest_action, 0.0
         observation, info = self.env.reset(seed=seed, options=options)
-        return self._seen(observation), _known(info)
+        return self._as_array(observation), _completed(info)
 
     def step(self, action: Action) -> tuple[NDArray[Any], float, bool, bool, dict[str, Any]]:
         """Drive for one control period."""
         self._last_action = np.asarray(action, np.float32)
         own = outer(self.action_range, action).reshape(self._space.shape)
-        seen, reward, terminated, truncated, info = self.env.step(own.astype(self._space.dtype))
-        info, reward = _known(info), bridge.finite("reward", reward)
+        own = own.astype(self._space.dtype)
+        observation, reward, terminated, truncated, info = self.env.step(own)
+        info, reward = _completed(info), bridge.finite("reward", reward)
         self._return += reward
         if terminated or truncated:
             if self.judge:
-                info["is_success"] = self.judge(seen, info, self._return)
+                info["is_success"] = self.judge(observation, info, self._return)
             info["outcome"] = outcome_of(info, only_truncated=not terminated)
-        return self._seen(seen), reward, bool(terminated), bool(truncated), info
+        return self._as_array(observation), reward, bool(terminated), bool(truncated), info
 
     def close(self) -> None:
-        """Close the environment: of some simulators only one may live in a process."""
+        """Close the environment: some simulators allow only one in a process."""
         self.env.close()
 
     @property
@@ -247,18 +248,18 @@ class Adapted(bridge.Adapter):
             return {"up": full, "right": full, "down": -full, "left": -full}
         return {name: inner(self.action_range, action) for name, action in own.items()}
 
-    def _seen(self, observation: Any) -> NDArray[Any]:
-        """Return one array; UserError for numbers that no network could learn from."""
-        seen = np.zeros(self.layout.shape, self.layout.dtype)
+    def _as_array(self, observation: Any) -> NDArray[Any]:
+        """Pack an observation into one array; UserError for a number that is not finite."""
+        packed = np.zeros(self.layout.shape, self.layout.dtype)
         for name, array in self.arrays(observation).items():
-            (seen[name] if seen.dtype.names else seen)[...] = array
+            (packed[name] if packed.dtype.names else packed)[...] = array
             largest = np.abs(array).max() if array.dtype.kind in "fi" else 0.0
             if not np.isfinite(largest):
                 raise UserError(f"{self.scenario} observes a number in {name} that is not finite")
             if largest > BEARABLE:
-                what = f"numbers beyond {BEARABLE:g}, of which no network learns: scale them"
-                bridge.say_once(f"{self.scenario} observes in {name} {what}")
-        return seen
+                advice = "scale them, or no network learns from them"
+                bridge.say_once(f"{self.scenario}: {name} exceeds {BEARABLE:g}; {advice}")
+        return packed
 
 
 class _ScaledExpert(Expert):
@@ -280,22 +281,22 @@ class _ScaledExpert(Expert):
         return bool(getattr(self._own, "may_return", lambda: True)())
 
 
-def _known(info: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the info with distance and speed, which are 0 and NaN where they are unknown."""
+def _completed(info: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the info with a distance and a speed, 0 and NaN where they are unknown."""
     unknown = {"distance_m": 0.0, "speed_mps": float("nan")}
     return unknown | {key: value for key, value in info.items() if value is not None}
 
 
 class DelayedVehicle:
-    """Wraps an environment whose policy acts over a network; the vehicle brakes by itself.
+    """Puts a simulated network between policy and vehicle; the vehicle brakes by itself.
 
-    Each control period ask a policy that is ``behind`` the network for the vehicle's action, and
-    step with it, or with a human's after ``release_brake``. The seed of an episode decides the
-    network's luck, too, as in ``bridge simulate``.
+    In each control period call the function that ``behind`` returned, and ``step`` with its action,
+    or with a human's after ``release_brake``. An episode's seed also seeds the network's delays and
+    losses, as in ``bridge simulate``.
 
-    A learner stores what happens at the vehicle beside what the policy knows of it: in tick n the
-    observation of tick n - d, the action carried out in tick n, its reward, and the observation of
-    tick n + 1 - d, where d (`ticks_late`) is how many ticks old a command is that is on time.
+    A learner pairs what happens at the vehicle with what the policy knew: for tick n it stores the
+    observation of tick n - d, the action and the reward of tick n, and the observation of tick
+    n + 1 - d, where d (`ticks_late`) is the age in ticks of a command that arrives on time.
     """
 
     def __init__(self, env: Any, spec: LatencySpec) -> None:
@@ -317,11 +318,10 @@ class DelayedVehicle:
         return self.env.step(action)
 
     def behind(self, policy: Callable[[Observation], Action]) -> Callable[[Observation], Action]:
-        """Return what the vehicle does with a policy on the other end: once a control period.
+        """Return a function from observation to the vehicle's action; call it once a period.
 
-        The policy is asked for each fresh observation that reaches the edge within the tick. The
-        vehicle obeys the newest command; it brakes where none has come for 2 T, or the command is a
-        safe stop.
+        The policy answers each fresh observation that reaches the edge within the tick. The vehicle
+        obeys the newest command; it brakes after 2 T without a command, and for a safe stop.
         """
 
         def carried_out(observation: Observation) -> Action:
@@ -345,13 +345,13 @@ class DelayedVehicle:
         self._press_brake(False)
 
     def _press_brake(self, pressed: bool) -> None:
-        """Brake or not until the next tick: a scenario whose action only steers has a pedal."""
+        """Press or release a brake that is no part of the action, as in the congestion."""
         self._braking = pressed
         getattr(self.env, "press_brake", lambda pressed: None)(pressed)
 
 
 def _command(step: int, action: Action) -> Command:
-    """Make a command as far as a virtual link looks at it."""
+    """Make a command with the fields that a virtual link reads."""
     return Command(
         session="", episode=0, step=step, mode=DRIVE, action=action.tolist(), policy_id="",
         received_ns=0, inference_ns=0, sent_ns=0,
@@ -359,7 +359,7 @@ def _command(step: int, action: Action) -> Command:
 
 
 def ticks_late(spec: LatencySpec, period_s: float) -> int:
-    """Return how many ticks old the state is that a command answers when it is on time."""
+    """Return the age in ticks of the state that a punctual command answers."""
     round_trip_s = (spec.up.delay_ms + spec.down.delay_ms) * 1e-3
     beyond_window_s = max(0.0, round_trip_s - COMMAND_WINDOW * period_s - ROUNDING_S)
     return math.ceil(beyond_window_s / period_s)

@@ -1,4 +1,4 @@
-"""Load whatever drives by its name, and drive test episodes with it."""
+"""Load a driver by name (policy file, run, human model, expert), and drive test episodes."""
 
 import argparse
 import json
@@ -45,23 +45,23 @@ from trainer.training.config import period_of
 from trainer.util import fitting, limited_threads, load_torch
 
 NO_NETWORK = LatencySpec()
-CONSTANT = "constant:"  # Before an action that is kept throughout: a floor for any policy
+CONSTANT = "constant:"  # Prefix of an action that is held throughout: a floor for any policy
 CHECKPOINT_FILE = "checkpoint.pt"
 BEST_FILE = "best_actor.pt"
-ActTogether = Callable[[Observation], Action]  # Many actions for many observations
+ActTogether = Callable[[Observation], Action]  # Actions for a batch of observations
 
 
 def run(arguments: argparse.Namespace) -> int:
     check_writable(arguments.out)
     names = ("policy", "scenario", "runs", "seed", "condition", "latency", "public_key", "video",
              "rerun")  # fmt: skip
-    found = evaluate(**{name: getattr(arguments, name) for name in names})
+    evaluation = evaluate(**{name: getattr(arguments, name) for name in names})
     if not arguments.out:
-        print(json.dumps(found.report, indent=2))
+        print(json.dumps(evaluation.report, indent=2))
         return 0
-    detail = [asdict(result) for result in found.episodes]
-    write_json_out(arguments.out, {**found.report, "per_episode": detail})
-    print(f"{found}: {arguments.out}")
+    detail = [asdict(result) for result in evaluation.episodes]
+    write_json_out(arguments.out, {**evaluation.report, "per_episode": detail})
+    print(f"{evaluation}: {arguments.out}")
     return 0
 
 
@@ -71,11 +71,11 @@ class Evaluation:
     episodes: list[EpisodeResult]
 
     def __repr__(self) -> str:
-        said = [counted(len(self.episodes), "episode"), f"return {self.mean_return:.2f}"]
+        parts = [counted(len(self.episodes), "episode"), f"return {self.mean_return:.2f}"]
         if (share := self.success_rate) is not None:
             count = len(self.episodes)
-            said.insert(1, f"success {success_estimate(round(share * count), count).as_share()} %")
-        return ", ".join(said)
+            parts.insert(1, f"success {success_estimate(round(share * count), count).as_share()} %")
+        return ", ".join(parts)
 
     @property
     def success_rate(self) -> float | None:
@@ -102,12 +102,12 @@ def evaluate(
 ) -> Evaluation:
     """Drive test episodes with a policy alone, as ``python -m trainer evaluate`` does.
 
-    ``policy`` may also be what ``train`` gave; ``scenario`` is by default what it was trained in,
-    else the left turn. Episode i is reset with ``seed + i``. ``on_step(transition, None, info)`` is
-    called after each control period; ``info`` has ``episode`` and ``step``, too.
+    ``policy`` may also be the result of ``train``; ``scenario`` defaults to the one it was trained
+    in, else the left turn. Episode i is reset with ``seed + i``. ``on_step(transition, None,
+    info)`` is called after each control period; ``info`` also holds ``episode`` and ``step``.
 
     Raises UserError: no such policy, condition or number of runs; a policy of another environment;
-    an environment that reports what is no number.
+    an environment whose reward or distance is no finite number.
     """
     if condition not in CONDITIONS:
         raise UserError(f"condition must be one of {', '.join(CONDITIONS)}: {condition}")
@@ -118,14 +118,14 @@ def evaluate(
     sink = None if rerun is None else check_sink(rerun)
     film = check_writable(video)
     if film and Path(film).suffix != ".mp4":
-        raise UserError(f"--video {video}: a film's name ends in .mp4")
+        raise UserError(f"--video {video}: the file's name must end in .mp4")
     recorders: list[Record] = [] if on_step is None else [on_step]
-    named, period_s = trained_in(policy, public_key)
-    named = scenario or name_in_file(named, f"{policy} was trained in", "--scenario")
-    scenario, seeds = scenario_of(named), range(seed, seed + runs)
+    of_training, period_s = trained_in(policy, public_key)
+    scenario = scenario or name_in_file(of_training, f"{policy} was trained in", "--scenario")
+    scenario, seeds = scenario_of(scenario), range(seed, seed + runs)
     with (
         closing(make_environment(scenario, condition, period_s=period_s)) as env,
-        limited_threads(1),  # The last bits must not depend on the cores.
+        limited_threads(1),  # The last bits must not depend on the number of cores.
         ProgressBar("evaluating", runs) as bar,
         ExitStack() as stack,
     ):
@@ -146,7 +146,7 @@ def evaluate(
 def trained_in(policy: str, public_key: str | None) -> tuple[str, float | None]:
     """Return the scenario of a run, a human model or a policy file, and its control period, s.
 
-    The period is None where the environment said it. Anything else drives the left turn.
+    The period is None for the environment's own. Any other policy drives the left turn.
     """
     for name in ("config.json", "human.json"):
         if (Path(policy) / name).is_file():
@@ -157,13 +157,13 @@ def trained_in(policy: str, public_key: str | None) -> tuple[str, float | None]:
     manifest = load_policy(policy, public_key, allow_unsigned=True).manifest
     config = manifest.training.get("config")
     named = config.get("scenario") if isinstance(config, dict) else None
-    # One of `deploy policy` names its environment itself.
+    # A file of `deploy policy` holds no training config, but names its environment.
     name = str(named or manifest.training.get("environment") or manifest.task)
     return scenario_of(name), manifest.control_period_s
 
 
 class Loaded(NamedTuple):
-    """A policy file that answers."""
+    """A loaded policy file."""
 
     policy: Policy  # The edge runtime's
 
@@ -171,19 +171,19 @@ class Loaded(NamedTuple):
         return f"{self.policy.policy_id[:12]}: {self.policy.manifest.text}"
 
     def act(self, observation: Any) -> NDArray[np.float32]:
-        """Return the action [n], in its range, for an observation as the environment gives it."""
+        """Return the action [n], clipped to its range, for an environment's own observation."""
         manifest = self.policy.manifest
         ends = np.array([(row.low, row.high) for row in manifest.action], np.float32).T
         return np.clip(self.policy.act(arrays_of(manifest, observation)), *ends)
 
 
 def load(path: str | PathLike[str], public_key: str | PathLike[str] | None = None) -> Loaded:
-    """Load a policy file, signed or not; a known public key must verify its signature."""
+    """Load a policy file, signed or not; ``public_key``, if given, must verify its signature."""
     return Loaded(load_policy(path, public_key, allow_unsigned=True))
 
 
 class TogetherDriver(Driver):
-    """Drives without a memory, one observation at a time or many at once.
+    """Drives without memory, one observation at a time or a batch at once.
 
     ``act_together`` gives actions float32 [n, action size] for observations [n, ...].
     """
@@ -196,14 +196,14 @@ class TogetherDriver(Driver):
 
 
 def constant_driver(action: float, size: int = 1) -> TogetherDriver:
-    """Return a driver with one action throughout; ValueError unless it is from -1 to 1."""
+    """Return a driver that holds one action; ValueError unless it is from -1 to 1."""
     if not -1.0 <= action <= 1.0:
         raise ValueError(action)
-    return TogetherDriver(lambda seen: np.full((len(seen), size), action, np.float32))
+    return TogetherDriver(lambda batch: np.full((len(batch), size), action, np.float32))
 
 
 class OnnxDriver(Driver):
-    """Drives with an exported policy file, in the edge runtime's own loader."""
+    """Drives with an exported policy file, loaded as the edge runtime loads it."""
 
     def __init__(self, path: Path, public_key: str | None = None) -> None:
         self.policy = load_policy(str(path), public_key, allow_unsigned=True)
@@ -219,9 +219,9 @@ class OnnxDriver(Driver):
     def act(self, observation: Observation) -> Action:
         """Return the policy's action, float32 [action size], scaled to [-1, 1].
 
-        It keeps to the manifest's range and rate of change, as the edge does: onnxruntime's tanh
-        exceeds 1 by a last bit now and then. Answers count as a control period apart; the edge
-        measures the time, so behind jitter it may allow less.
+        It is limited to the manifest's range and rate of change, as on the edge: onnxruntime's tanh
+        sometimes exceeds 1 by the last bit. Calls count as one control period apart; the edge
+        measures the time, so under jitter it may allow less.
         """
         wanted = self.policy.act(entries_of(observation, self._plain)).tolist()
         self._last = limit_action(wanted, self._last, self._limits, self._period_s)
@@ -235,7 +235,7 @@ def is_expert(word: str) -> bool:
 
 
 def located(driver: str) -> str:
-    """Return a driver's name with any path absolute: a simulator may change the directory."""
+    """Make a driver's path absolute, other names as they are: a simulator may change directory."""
     return driver if is_expert(driver) or not Path(driver).exists() else os.path.abspath(driver)
 
 
@@ -243,7 +243,7 @@ def load_driver(policy: str, env: Any, public_key: str | None = None) -> tuple[D
     """Return the driver that the word or path ``policy`` names, and its policy id.
 
     ``public_key`` is a PEM file to verify an .onnx file with; see `edge_runtime.policy`. Raises
-    UserError where nothing drives.
+    UserError: no such driver, or one for another environment.
     """
     if is_expert(policy):
         return expert_of(env, policy), policy
@@ -254,8 +254,8 @@ def load_driver(policy: str, env: Any, public_key: str | None = None) -> tuple[D
     path = Path(policy)
     if path.suffix == ".onnx":
         driver, wanted = OnnxDriver(path, public_key), task_of(env).text
-        if (found := driver.policy.manifest.text) != wanted:
-            raise UserError(f"{policy} is for {found}, and {env.scenario} asks for {wanted}")
+        if (task := driver.policy.manifest.text) != wanted:
+            raise UserError(f"{policy} is for {task}, but {env.scenario} needs {wanted}")
         return driver, driver.policy.policy_id
     if (path / MODEL_FILE).is_file():
         return TogetherDriver(load_human_model(path, env)[0].eval().act), f"human:{path.name}"
@@ -269,33 +269,33 @@ def load_driver(policy: str, env: Any, public_key: str | None = None) -> tuple[D
 
 
 def load_actor(run_dir: Path, env: Any) -> tuple[Actor, dict[str, Any]]:
-    """Return a run's best actor on the validation seeds, or the last where none was validated.
+    """Return a run's best validated actor, or its last one if none was validated, and its label.
 
-    With it comes the label of the run: ``scenario``, ``algorithm``, ``seed``, ``episode``. Raises
-    UserError for no run, or a run in another environment than ``env``.
+    The label holds ``scenario``, ``algorithm``, ``seed`` and ``episode``. Raises UserError for no
+    run, or a run in another environment than ``env``.
     """
-    there = [run_dir / name for name in (BEST_FILE, CHECKPOINT_FILE)]
-    path = next((path for path in there if path.is_file()), None)
+    paths = [run_dir / name for name in (BEST_FILE, CHECKPOINT_FILE)]
+    path = next((path for path in paths if path.is_file()), None)
     if path is None:
         raise UserError(f"{run_dir} holds no training run ({BEST_FILE} or {CHECKPOINT_FILE})")
     state = load_torch(path)
     with fitting(f"{path} is not a checkpoint of this project"):
         networks = state if path.name == BEST_FILE else state["learning"]["learner"]
         weights = networks[state.get("kept_actor", "actor")]
-        told = {key: state[key] for key in ("scenario", "algorithm", "seed", "episode")}
-        label: dict[str, Any] = msgspec.convert(told, dict[str, str | int])
+        fields = {key: state[key] for key in ("scenario", "algorithm", "seed", "episode")}
+        label: dict[str, Any] = msgspec.convert(fields, dict[str, str | int])
         check_trained_in(env, run_dir, label["scenario"])
-        first = next((w for name, w in weights.items() if name.endswith("conv1.weight")), None)
-        frames = 2 if first is None else first.shape[1]
+        conv1 = next((w for name, w in weights.items() if name.endswith("conv1.weight")), None)
+        frames = 2 if conv1 is None else conv1.shape[1]
         actor = Actor(len(weights["head.output.bias"]), frames, env.observation_space)
         actor.load_state_dict(weights)
     return actor, label
 
 
 class Drive:
-    """A test episode under way; its driver sees ``observation`` next.
+    """A test episode: ``step`` with the action for ``observation`` until it is ``over``.
 
-    Gaussian noise of standard deviation ``noise_std`` is added to commands, with the same seed.
+    Gaussian noise of standard deviation ``noise_std``, drawn by the same seed, disturbs the action.
     """
 
     def __init__(self, env: Any, seed: int, noise_std: float = 0.0) -> None:
@@ -305,30 +305,30 @@ class Drive:
         """Complete once the episode is over."""
         self.observation, _ = env.reset(seed=seed)
         self._noise = np.random.default_rng([seed, 1])
-        self._felt: list[list[float | None]] = []
+        self._accelerations: list[list[float | None]] = []
 
     def step(self, action: Action) -> None:
-        """Drive one control period: ``seen``, and the step's ``info``."""
+        """Drive one control period; set ``transition`` and ``info``."""
         wanted = action
         if self.noise_std:
             disturbed = action + self._noise.normal(0.0, self.noise_std, action.shape)
             action = np.clip(disturbed, -1.0, 1.0).astype(np.float32)
         before = self.observation
         self.observation, reward, terminated, truncated, info = self.env.step(action)
-        ends = terminated, truncated
-        self.seen = Transition(before, action, reward, self.observation, *ends, overruled=wanted)
+        after, ends = self.observation, (terminated, truncated)
+        self.transition = Transition(before, action, reward, after, *ends, overruled=wanted)
         self.info = info
         result, self.over = self.result, terminated or truncated
         result.actions.append([float(a) for a in action])
         result.reward += finite("reward", reward)
-        self._felt.append(accelerations(info))
+        self._accelerations.append(accelerations(info))
         if self.over:
             result.outcome = info["outcome"]
             result.distance_m = finite("distance_m", info["distance_m"])
             result.steps = len(result.actions)
             result.time_s = result.steps * self.env.control_period_s
             result.lateral_acceleration_mps2, result.longitudinal_acceleration_mps2 = map(
-                of_known, zip(*self._felt, strict=True)
+                of_known, zip(*self._accelerations, strict=True)
             )
 
 
@@ -367,7 +367,7 @@ def drive_episodes(
 ) -> list[EpisodeResult]:
     """Drive one episode for each seed under a condition.
 
-    The condition's noise is added here; its scene is the environment's (``make_environment``).
+    The condition's noise is added here; ``make_environment`` has chosen its scene.
     ``latency`` is the network between driver and vehicle, in virtual time.
     """
     results, act = [], driver.act
@@ -381,7 +381,7 @@ def drive_episodes(
             drive.step(act(drive.observation))
             for record in recorders:
                 place = {"episode": episode, "step": len(drive.result.actions)}
-                record(drive.seen, None, {**drive.info, **place})
+                record(drive.transition, None, {**drive.info, **place})
         results.append(drive.result)
         on_episode(drive.result)
     return results

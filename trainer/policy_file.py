@@ -26,7 +26,7 @@ from trainer.evaluation import load_actor
 from trainer.learner.networks import Actor
 from trainer.training.config import CONFIG_FILE, period_of
 
-OPSET = 17  # The oldest onnxruntime that a board may have reads it
+OPSET = 17  # Readable by the oldest onnxruntime that a board may have
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -56,17 +56,17 @@ def export(
 ) -> Export:
     """Write a run's actor as a policy file, as ``python -m trainer export`` does.
 
-    ``run`` is the result of ``train``, or its directory; ``scenario`` what it was trained in, to be
-    named where that is ``module:ID``; ``key`` the private key (PEM) that signs.
+    ``run`` is the result of ``train``, or its directory. ``scenario``, that of the training, is
+    needed only where it is ``module:ID``. ``key`` is the private key (PEM) that signs the file.
 
-    Raises UserError: no run there, a wrong name or key, or a file that differs from the actor.
+    Raises UserError: no run there, a wrong name or key, or onnxruntime differs from the actor.
     """
     scenario = scenario or getattr(run, "scenario", None)
     # Absolute: a simulator may change the working directory.
     file, run = Path(out).absolute(), Path(run).absolute()
     key = None if key is None else Path(key).absolute()
     if file.suffix != ".onnx":
-        raise UserError(f"--out {file}: a policy file's name ends in .onnx")
+        raise UserError(f"--out {file}: the file's name must end in .onnx")
     check_writable(file)
     config = read_json(run / CONFIG_FILE, "run config")
     named = str(config.get("scenario"))
@@ -83,8 +83,8 @@ def export_policy(
 ) -> Export:
     """Convert an actor, describe it in a manifest, and compare torch with onnxruntime.
 
-    ``label`` has ``algorithm``, ``seed`` and ``episode`` of the run; the manifest holds its whole
-    config (``training``). Raises UserError: the two differ.
+    ``label`` has ``algorithm``, ``seed`` and ``episode`` of the run; ``training``, its config, goes
+    into the manifest. Raises UserError if the two differ.
     """
     network, task = _InOwnUnits(actor, env.action_range).eval(), task_of(env)
     about = {"seed": label["seed"], "episodes": label["episode"], "config": training}
@@ -93,8 +93,8 @@ def export_policy(
 
     def act(entries: Arrays) -> NDArray[Any]:
         with torch.no_grad():
-            seen = [torch.from_numpy(array[None].copy()) for array in entries.values()]
-            return np.asarray(network(*seen)[0])
+            batch = [torch.from_numpy(array[None].copy()) for array in entries.values()]
+            return np.asarray(network(*batch)[0])
 
     policy = open_policy(model, UNSIGNED)
     return Export(model, policy.policy_id, try_policy(policy, own_environment(env), model, act))
@@ -118,9 +118,9 @@ class _InOwnUnits(torch.nn.Module):
 
 
 class LibraryPolicy(torch.nn.Module):
-    """A policy of Stable-Baselines3 as its ``predict`` goes, behind a VecNormalize or None.
+    """A policy of Stable-Baselines3 that acts as its ``predict`` does.
 
-    ``names``: of its observation's entries.
+    ``normaliser`` is a VecNormalize or None, ``names`` are those of the observation's entries.
     """
 
     def __init__(self, policy: Any, normaliser: Any, names: Sequence[str]) -> None:
@@ -132,32 +132,33 @@ class LibraryPolicy(torch.nn.Module):
 
     def act(self, entries: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
         """Return the library's own action for one observation, in the environment's units."""
-        seen: Any = {name: np.array(array[None]) for name, array in entries.items()}
-        seen = seen if self._spaces else seen[self.names[0]]
-        seen = self._normaliser.normalize_obs(seen) if self._normaliser else seen
-        return np.ravel(self.policy.predict(seen, deterministic=True)[0])
+        batch: Any = {name: np.array(array[None]) for name, array in entries.items()}
+        batch = batch if self._spaces else batch[self.names[0]]
+        batch = self._normaliser.normalize_obs(batch) if self._normaliser else batch
+        return np.ravel(self.policy.predict(batch, deterministic=True)[0])
 
     def forward(self, *entries: torch.Tensor) -> torch.Tensor:
-        seen: Any = dict(map(self._prepared, self.names, entries))
-        seen = seen if self._spaces else seen[self.names[0]]
-        action = self.policy._predict(seen, deterministic=True).reshape(-1, len(self._low))
+        batch: Any = dict(map(self._prepared, self.names, entries))
+        batch = batch if self._spaces else batch[self.names[0]]
+        action = self.policy._predict(batch, deterministic=True).reshape(-1, len(self._low))
         if self.policy.squash_output:
             return self._low + 0.5 * (action + 1.0) * (self._high - self._low)
         return torch.clamp(action, self._low, self._high)
 
     def _prepared(self, name: str, entry: torch.Tensor) -> tuple[str, torch.Tensor]:
-        by, space = self._normaliser, (self._spaces or {}).get(name, self.policy.observation_space)
-        rms = by.obs_rms if by and by.norm_obs else {}
+        space = (self._spaces or {}).get(name, self.policy.observation_space)
+        norm = self._normaliser
+        rms = norm.obs_rms if norm and norm.norm_obs else {}
         if rms := rms.get(name) if isinstance(rms, dict) else rms:
-            std = torch.from_numpy(np.sqrt(rms.var + by.epsilon))
+            std = torch.from_numpy(np.sqrt(rms.var + norm.epsilon))
             entry = (entry.double() - torch.from_numpy(rms.mean)) / std
-            entry = entry.clamp(-by.clip_obs, by.clip_obs).float()
-        is_turned = tuple(entry.shape[1:]) != space.shape  # Channels last, as pictures come
-        return name, entry.permute(0, 3, 1, 2) if is_turned else entry
+            entry = entry.clamp(-norm.clip_obs, norm.clip_obs).float()
+        channels_last = tuple(entry.shape[1:]) != space.shape  # The policy's space has them first.
+        return name, entry.permute(0, 3, 1, 2) if channels_last else entry
 
 
 def to_onnx(network: torch.nn.Module, task: Task) -> bytes:
-    """Convert a network from the task's entries, each behind a batch, to the action."""
+    """Convert a network to ONNX; inputs are the task's entries, each with a batch dimension."""
     entries = task.observation.items()
     examples = [torch.zeros((1, *e.shape), dtype=getattr(torch, e.dtype)) for _, e in entries]
     names, buffer = list(task.observation), BytesIO()

@@ -1,8 +1,8 @@
 """``python -m deploy policy``, which also takes the model.zip of Stable-Baselines3.
 
-The library pickles, and a pickle is a program. Here it can call only what `KNOWN` lists; anything
-else that it names becomes an object that does nothing. Arrays hold plain numbers, and memory is
-limited: a few bytes can ask for all of it.
+The file holds pickles, and a pickle is a program. This reader lets it call only what `KNOWN` lists;
+any other name becomes an object that does nothing. Arrays hold plain numbers only. Memory is
+limited, since a few bytes can demand all of it.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ KNOWN = {
     "numpy._core.numeric": "_frombuffer",
     "collections": "OrderedDict",
 }  # fmt: skip
-"""All that a pickle may name: module -> names."""
+"""Names that a pickle may call, by module."""
 MOST_MIB, MOST_MEMORY_MIB = 512, 4096
-OTHERWISE = "export an ONNX that holds all of it, as docs/own_policy.md says"
+OTHERWISE = "export a complete ONNX file yourself, as docs/own_policy.md says"
 
 
 class _Unknown:
@@ -54,18 +54,18 @@ class _Unknown:
 
 
 class _Array(np.ndarray):
-    """An array of a pickle, which may not call it: a buffer could pass for Python objects."""
+    """Stands for ndarray; a pickle may not call it: a buffer could pose as Python objects."""
 
     def __new__(cls, *_: Any) -> Any:
         raise TypeError("an array is made by _reconstruct")
 
 
 def _plain(dtype: Any, *_: Any) -> np.dtype[Any]:
-    """Return numpy's own type of plain numbers: a pickle's `__setstate__` cannot change that."""
-    made = np.dtype(np.dtype(dtype).type)
-    if made.kind not in "biuf":
-        raise TypeError(made)
-    return made
+    """Return numpy's own type of plain numbers, which a pickle's `__setstate__` cannot change."""
+    plain = np.dtype(np.dtype(dtype).type)
+    if plain.kind not in "biuf":
+        raise TypeError(plain)
+    return plain
 
 
 def _scalar(dtype: np.dtype[Any], data: bytes) -> Any:
@@ -77,7 +77,7 @@ OURS = {
     ("numpy", "dtype"): _plain,
     ("numpy._core.multiarray", "scalar"): _scalar,
 }
-"""In place of numpy's own, which can be made to take any number for an object's address."""
+"""Replace numpy's own, which a pickle can make treat any number as an object's address."""
 
 
 class _Reader(pickle.Unpickler):
@@ -94,16 +94,16 @@ def _read(pickled: bytes) -> Any:
     return _Reader(io.BytesIO(pickled)).load()
 
 
-def _space(made: Any) -> Any:
-    """Make a space anew from the numbers of one that was read; of others, return the name."""
-    if isinstance(made, Dict):
-        return Dict([(name, _box(each)) for name, each in made.spaces.items()])
-    return _box(made)
+def _space(read: Any) -> Any:
+    """Rebuild a Box, or a Dict of them, from one that was read; return another's class name."""
+    if isinstance(read, Dict):
+        return Dict([(name, _box(each)) for name, each in read.spaces.items()])
+    return _box(read)
 
 
-def _box(made: Any) -> Any:
-    is_box = isinstance(made, Box)
-    return Box(made.low, made.high, dtype=made.dtype) if is_box else type(made).__name__
+def _box(read: Any) -> Any:
+    is_box = isinstance(read, Box)
+    return Box(read.low, read.high, dtype=read.dtype) if is_box else type(read).__name__
 
 
 @limited_memory(MOST_MEMORY_MIB)
@@ -113,7 +113,7 @@ def read_model(arguments: argparse.Namespace, environment: Environment, task: Ta
     Raises UserError for another file, for parts that are not the library's, and for a model of
     other observations or actions than the environment's.
     """
-    path, normaliser, done = Path(arguments.model), None, environment.action_space
+    path, normaliser, action_space = Path(arguments.model), None, environment.action_space
     what = f"model.zip of {LIBRARY} (SAC, TD3, DDPG, PPO, A2C), or that library is not installed"
     with fitting(f"{path} is no {what}"):
         archive = zipfile.ZipFile(io.BytesIO(read_bytes(path, "model", MOST_MIB)))
@@ -122,49 +122,49 @@ def read_model(arguments: argparse.Namespace, environment: Environment, task: Ta
         for name in ("policy_class", "policy_kwargs", "observation_space", "action_space"):
             if packed := data[name].get(":serialized:"):
                 data[name] = _read(base64.b64decode(packed))
-        seen, acts = (_space(data[f"{each}_space"]) for each in ("observation", "action"))
+        observed, acted = (_space(data[f"{each}_space"]) for each in ("observation", "action"))
         kind, options, on_policy = data["policy_class"], data["policy_kwargs"], "gae_lambda" in data
         options = {n: value for n, value in options.items() if not n.startswith("optimizer")}
         for name, each in {"policy_class": kind, **options}.items():
             if _Unknown in (type(each).__base__, getattr(each, "__base__", None)):
-                raise UserError(f"the {name} of {path} is not the library's: {OTHERWISE}")
-    if acts != done:
-        raise UserError(f"{path} acts in {acts}, {task.task} in {done}")
+                raise UserError(f"the {name} of {path} is not one of {LIBRARY}: {OTHERWISE}")
+    if acted != action_space:
+        raise UserError(f"{path} acts in {acted}, {task.task} in {action_space}")
     if arguments.normalise:
         normaliser = read_normaliser(arguments.normalise)
-    elif on_policy and data.get("_last_original_obs"):  # The others always have one.
+    elif on_policy and data.get("_last_original_obs"):  # Off-policy models always have one.
         raise UserError(f"{path} was trained behind a VecNormalize: add --normalise")
 
     from trainer.policy_file import LibraryPolicy, to_onnx  # It loads torch
 
-    unfit = f"{path} does not fit {task.task}: it observes {seen}"
+    unfit = f"{path} does not fit {task.task}: it observes {observed}"
     with fitting(unfit):
         options = {"use_sde": data["use_sde"], **options} if on_policy else options
-        policy = kind(seen, done, lambda _: 0.0, **options)
+        policy = kind(observed, action_space, lambda _: 0.0, **options)
         policy.load_state_dict(weights)
         network = LibraryPolicy(policy.eval(), normaliser, [*task.observation])
         algorithm = kind.__module__.split(".")[1]
         if on_policy:
             algorithm = "ppo" if "clip_range" in data else "a2c"
-        elif data.get("target_noise_clip") == 0.0:  # Its targets are not smoothed.
+        elif data.get("target_noise_clip") == 0.0:  # TD3 without target smoothing
             algorithm = "ddpg"
         return Model(to_onnx(network, task), algorithm, fitting(unfit)(network.act))
 
 
 def read_normaliser(file: str) -> Any:
     """Read the library's VecNormalize; UserError for anything else."""
-    with fitting(f"{file} is no VecNormalize that {LIBRARY} has saved: {OTHERWISE}"):
-        made = _read(read_bytes(file, "normalisation"))
-        if not hasattr(made, "normalize_obs"):
-            raise TypeError(type(made))
-        return made
+    with fitting(f"{file} is no VecNormalize saved by {LIBRARY}: {OTHERWISE}"):
+        normaliser = _read(read_bytes(file, "normalisation"))
+        if not hasattr(normaliser, "normalize_obs"):
+            raise TypeError(type(normaliser))
+        return normaliser
 
 
 def _run(arguments: argparse.Namespace) -> int:
     if arguments.model.endswith(".zip"):
         return policy_file.run(arguments, read_model)
     if arguments.normalise:
-        raise UserError("--normalise is of a model.zip: ONNX holds its own normalisation")
+        raise UserError("--normalise is for a model.zip; an ONNX file holds its own normalisation")
     return policy_file.run(arguments)
 
 

@@ -28,7 +28,7 @@ import numpy as np
 from edge_runtime.files import check_writable, make_directory, try_to_lock_file, write_atomic
 from edge_runtime.util import UserError, open_regular
 
-PERIOD_S = 0.1  # Of an environment that does not say how long a step is
+PERIOD_S = 0.1  # Control period of an environment that names none
 DEVICES = ("cpu", "cuda")
 CPU_INFO = Path("/proc/cpuinfo")
 Range = tuple[float, float]
@@ -88,9 +88,9 @@ def save_torch(path: Path, state: Any) -> None:
 
 
 def load_torch(path: Path, data: bytes | None = None) -> dict[str, Any]:
-    """Read what ``save_torch`` wrote, else UserError; only tensors and plain values are read.
+    """Read a file of ``save_torch``: tensors and plain values only; UserError for any other file.
 
-    ``data``: instead of the file's.
+    ``data`` replaces the file's bytes.
     """
     import torch
 
@@ -98,8 +98,8 @@ def load_torch(path: Path, data: bytes | None = None) -> dict[str, Any]:
         with open_regular(path) if data is None else io.BytesIO(data) as stream:
             archive = zipfile.ZipFile(stream)
             if any(part.compress_type for part in archive.infolist()):
-                raise ValueError("torch compresses nothing")  # What was not torch's could be huge
-            # torch writes a checksum of each part, and checks none.
+                raise ValueError("torch compresses nothing")  # Others may unpack to any size
+            # torch writes a checksum of each part, but never checks it.
             if damaged := archive.testzip():
                 raise ValueError(f"{damaged} is damaged")
             stream.seek(0)
@@ -113,7 +113,7 @@ def load_torch(path: Path, data: bytes | None = None) -> dict[str, Any]:
 
 @contextmanager
 def fitting(words: str) -> Iterator[None]:
-    """Turn any error that a crafted or foreign file causes into a UserError of these words."""
+    """Turn any error that a crafted or foreign file causes into a UserError with this text."""
     try:
         yield
     except UserError:
@@ -124,12 +124,12 @@ def fitting(words: str) -> Iterator[None]:
 
 @contextmanager
 def limited_memory(most_mib: int) -> Iterator[None]:
-    """Let this process take at most so much memory more; what asks for more fails by itself."""
+    """Limit the memory that this process may take in addition; a larger allocation fails."""
     soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
     pages = int(Path("/proc/self/statm").read_text().split()[5])
     most = pages * resource.getpagesize() + (most_mib << 20)
-    known = [each for each in (soft, hard, most) if each != resource.RLIM_INFINITY]
-    resource.setrlimit(resource.RLIMIT_DATA, (min(known), hard))
+    limits = [limit for limit in (soft, hard, most) if limit != resource.RLIM_INFINITY]
+    resource.setrlimit(resource.RLIMIT_DATA, (min(limits), hard))
     try:
         yield
     finally:
@@ -138,7 +138,7 @@ def limited_memory(most_mib: int) -> Iterator[None]:
 
 @contextmanager
 def claimed(directory: Path) -> Iterator[None]:
-    """Be the only process of this machine that works in a directory; UserError where it is not.
+    """Lock a directory for this process alone; UserError if another process uses it.
 
     A missing directory is made, and removed again if it stays empty.
     """
@@ -146,12 +146,12 @@ def claimed(directory: Path) -> Iterator[None]:
     with held(directory) as mine:
         if not mine:
             raise UserError(f"{directory} is in use by another process")
-        for draft in directory.glob(f".{16 * '[0-9a-f]'}.tmp"):  # Of a writer that was killed
+        for draft in directory.glob(f".{16 * '[0-9a-f]'}.tmp"):  # Left by a killed writer
             draft.unlink(missing_ok=True)
         try:
             yield
         finally:
-            with suppress(OSError):  # It holds something.
+            with suppress(OSError):  # Not empty
                 for path in made:
                     path.rmdir()
 
@@ -179,7 +179,7 @@ def cores() -> int:
 
 
 def begin_process(niceness: int) -> None:
-    """Leave ^C, which a terminal sends to all, to the parent; end with it; be nice to others."""
+    """Set up a worker: leave ^C to the parent, end with the parent, lower the priority."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=die_with_parent, daemon=True).start()
     os.nice(niceness)
@@ -194,7 +194,7 @@ def die_with_parent() -> None:
 
 
 def kept(path: str) -> str:
-    """Return the path of a file of the repository, from any folder; unchanged in its root."""
+    """Return a repository file's path, valid in any folder; unchanged in the root."""
     root = Path(__file__).parents[1]
     return path if Path.cwd() == root else str(root / path)
 
@@ -204,10 +204,10 @@ def source_revision(directory: Path = Path(__file__).parent) -> str:
     """Return a repository's commit, ``-dirty`` where files differ from it, or ``unknown``."""
     describe = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
     try:
-        done = subprocess.run(describe, cwd=directory, capture_output=True, text=True, check=True)
+        git = subprocess.run(describe, cwd=directory, capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
-    return done.stdout.strip()
+    return git.stdout.strip()
 
 
 def cpu_info() -> list[str]:
@@ -227,12 +227,12 @@ def processor_model() -> str:
 
 
 def deadline_s(minutes: float | None, clock: Callable[[], float] = time.monotonic) -> float:
-    """Return when the minutes are over, by ``clock``; infinity without a limit."""
+    """Return the time in so many minutes, by ``clock``; infinity for None."""
     return math.inf if minutes is None else clock() + 60.0 * minutes
 
 
 def check_device(device: str) -> None:
-    """Raise UserError unless the learner can compute there."""
+    """Raise UserError unless the learner can compute on the device."""
     import torch
 
     if device not in DEVICES:

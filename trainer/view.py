@@ -28,23 +28,23 @@ from trainer.human.guide import Record
 from trainer.learner.replay import Transition
 from trainer.scenarios import SCENARIOS
 
-HELD_S = 1.0  # An episode's last picture in a film
+HELD_S = 1.0  # How long a film shows an episode's last picture
 PLOTS = {"action": "Action, from -1 to 1", "speed": "Speed, m/s", "reward": "Reward of a step"}
 
 
 @contextmanager
 def drives_watched(env: Any, sink: str) -> Iterator[Record]:
-    """Show test episodes, every step of them; yield what takes a control period."""
+    """Show every step of test episodes in rerun; yield the function that records a step."""
     numbers = count()
 
-    def record(seen: Transition, _: Any, info: Mapping[str, Any]) -> None:
+    def record(step: Transition, _: Any, info: Mapping[str, Any]) -> None:
         canvas.stand_at(next(numbers))
-        assert seen.overruled is not None  # Of a drive: what the policy asked for
-        canvas.scalar("action/policy", *seen.overruled)
-        canvas.scalar("action/applied", *seen.action)
+        assert step.overruled is not None  # The policy's action, before the command noise
+        canvas.scalar("action/policy", *step.overruled)
+        canvas.scalar("action/applied", *step.action)
         canvas.scalar("speed/ego", info["speed_mps"])
-        canvas.scalar("reward/step", seen.reward)
-        canvas.observation(entries_of(seen.observation, "frames"))
+        canvas.scalar("reward/step", step.reward)
+        canvas.observation(entries_of(step.observation, "frames"))
         scene, picture = _from_above(env)
         if scene is not None or picture is not None:
             canvas.road(scene, picture, POLICY)
@@ -58,8 +58,8 @@ def drives_watched(env: Any, sink: str) -> Iterator[Record]:
 
 
 def _from_above(env: Any) -> tuple[SeenScene | None, Any]:
-    """Return the scene, or what the environment draws, where there is one."""
-    with suppress(Exception):  # Of any kind: it is somebody else's code, and the drive goes on.
+    """Return the scene, else the environment's picture; None for what it does not have."""
+    with suppress(Exception):  # An environment's own code may raise anything; the drive goes on.
         if (scene := env.scene()) is not None:
             return read_scene(scene), None
         return None, rr.Image(env.render(), color_model="RGB")
@@ -75,20 +75,20 @@ def lay_out(scene: SeenScene | None) -> rrb.Blueprint:
 
 @contextmanager
 def filmed(env: Any, target: Path) -> Iterator[Record]:
-    """Film test episodes; yield what takes a control period. A film appears when it is complete."""
+    """Film test episodes; yield the function that films a step. The file appears once complete."""
     from bridge.lerobot import film  # It needs an extra
 
     if env.scenario not in SCENARIOS and not draws(env.env):
-        raise UserError(f"{env.scenario} draws no rgb_array that could be filmed")
+        raise UserError(f"{env.scenario} has no render mode rgb_array to film")
     make_directory(target.parent)
     part, period_s = target.with_name(f".{os.getpid()}.{target.name}"), env.control_period_s
 
-    def record(seen: Transition, _: Any, info: Mapping[str, Any]) -> None:
+    def record(step: Transition, _: Any, info: Mapping[str, Any]) -> None:
         picture, at_s = Image.fromarray(np.asarray(env.render())), info["step"] * period_s
-        said = f"episode {info['episode'] + 1}, {at_s:.1f} s {info.get('outcome', '')}"
+        caption = f"episode {info['episode'] + 1}, {at_s:.1f} s {info.get('outcome', '')}"
         look: Any = {"font_size": 18, "stroke_width": 2, "stroke_fill": "white"}
-        ImageDraw.Draw(picture).text((8, 6), said, "black", **look)
-        for _ in range(round(HELD_S / period_s) if seen.terminal or seen.truncated else 1):
+        ImageDraw.Draw(picture).text((8, 6), caption, "black", **look)
+        for _ in range(round(HELD_S / period_s) if step.terminal or step.truncated else 1):
             add(np.asarray(picture))
 
     try:
