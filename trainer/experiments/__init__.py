@@ -1,4 +1,4 @@
-"""Studies: which runs a table compares, with which settings and budgets, and the digest of each.
+"""Define the studies: the runs of each table, their settings and budgets, and a digest of each.
 
 The data is in ``plan.toml``; a new table is a new study there.
 """
@@ -20,14 +20,14 @@ from trainer.environments import CONDITIONS
 from trainer.learner.config import ALGORITHMS, FASTER, task_settings
 
 RESULTS_VERSION = 1
-"""Raised by hand when a change of the code makes earlier records another experiment."""
+"""Raise by hand when a change of the code would give other records than the earlier ones."""
 DATA: Mapping[str, Any] = tomllib.loads(Path(__file__).with_name("plan.toml").read_text())
-for _each in (
+for _row in (
     *DATA["experiments"].values(),
     *(row for study in DATA["studies"].values() for row in study["rows"]),
 ):
-    _named = (DATA["groups"].get(name, [name]) for name in _each["algorithms"])
-    _each["algorithms"] = [name for names in _named for name in names]
+    _groups = (DATA["groups"].get(name, [name]) for name in _row["algorithms"])
+    _row["algorithms"] = [name for names in _groups for name in names]
 LABELS: Mapping[str, str] = DATA["labels"]
 TASKS: Mapping[str, Mapping[str, Any]] = DATA["tasks"]
 FULL_PATH_M: Mapping[str, float] = {
@@ -35,7 +35,7 @@ FULL_PATH_M: Mapping[str, float] = {
 }
 SCENARIOS = tuple(FULL_PATH_M)
 HUMAN_MODEL, CONSTANT = "human_model", "constant"
-"""In an algorithm's place: the human model alone, or the best constant action."""
+"""Used instead of an algorithm: the human model alone, or the best constant action."""
 BEST_CONSTANT: Mapping[str, Any] = DATA["best_constant"]
 HUMANS: Mapping[str, Any] = DATA["humans"]
 """Who guides in the table of human guidance."""
@@ -47,11 +47,11 @@ RIVALS = tuple(name for name in HELPED if name != "phil_td3")
 SHOWN: Mapping[str, Mapping[str, Any]] = DATA["shown"]
 """Row of the table of human guidance whose human does not take over -> its settings of a run."""
 TUNED: Mapping[str, Mapping[str, Any]] = dict.fromkeys(DATA["groups"]["guided"], FASTER)
-"""Row of the table of human guidance -> the hyper-parameters that its tuning chose in our scenes,
-where the paper's experiments have others. What it chose for other rows stands in ``ALGORITHMS``."""
+"""Row of the table of human guidance -> hyper-parameters that its tuning chose in our scenes, but
+that the paper's experiments do not use. Those of other rows are in ``ALGORITHMS``."""
 DEFAULT_SEEDS = 5
 PAPER_TESTS = 50
-"""Of the test drives in a scene, the first so many have the paper's seeds (section VII-D)."""
+"""The first of the test drives in a scene, which have the paper's seeds (section VII-D)."""
 
 
 def words(name: str) -> str:
@@ -108,7 +108,7 @@ class Unit(NamedTuple):
 
     @property
     def scripted_human(self) -> str:
-        """Who guides, or whom the human model imitates."""
+        """The scripted human who guides, or whom the human model imitates."""
         human: str = SETTINGS[self.setting].get("human", "")
         return human if ":" in human else TASKS[self.scenario]["expert"]
 
@@ -119,7 +119,7 @@ class Unit(NamedTuple):
 
 @dataclass(frozen=True)
 class StudyRow:
-    """Lines of a study: a setting or human, its algorithms, and where they are run."""
+    """Lines of a study: a setting or human, its algorithms, and their tasks."""
 
     setting: str
     algorithms: tuple[str, ...]
@@ -141,16 +141,16 @@ class Study:
     evaluate_every_steps: int = 500
     """Environment steps between two validations; the best validated actor is tested."""
     evaluation_runs: int = 50  # Drives of a validation
-    confirmation_factor: int = 0  # Times as many before an actor is kept; 0: none
+    confirmation_factor: int = 0  # As in ``RunConfig``
     test_runs: int = 250
     """Test drives in each scene, with the seeds 0, 1, ...: the paper's 50 first, then others."""
     checkpoint_every: int = 5
-    """Episodes between two checkpoints: what a kill costs, not what a run gives."""
+    """Episodes between two checkpoints; affects what a kill loses, not the result."""
     learner: Mapping[str, Any] = field(default_factory=dict)
     """Hyper-parameters changed for every algorithm alike."""
     by_task: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """Task -> fields that are others in it."""
-    name: str = ""  # Of its page's template, and of its folders in ``results`` and ``runs``
+    """Task -> fields with other values in it."""
+    name: str = ""  # Names the page's template and the folders in ``results`` and ``runs``
 
     def of(self, task: str) -> Study:
         return replace(self, **self.by_task.get(task, {}))
@@ -175,12 +175,12 @@ class Study:
         ]
         if not EXPERIMENTS.keys() >= set(names):
             return units
-        chosen = (EXPERIMENTS[name] for name in names)
-        wanted = {each for one in chosen for each in product(one.scenarios, one.lines)}
+        chosen = [EXPERIMENTS[name] for name in names]
+        wanted = {pair for each in chosen for pair in product(each.scenarios, each.lines)}
         return [unit for unit in units if (unit.scenario, unit[1:3]) in wanted]
 
     def config(self, unit: Unit) -> dict[str, Any]:
-        """Return what decides a unit's training, in plain words and values."""
+        """Return all settings that decide a unit's training, as plain values."""
         here, setting = self.of(unit.scenario), SETTINGS[unit.setting]
         human = HUMAN_MODEL if unit.needs_human else unit.scripted_human
         scenario = TASKS[unit.scenario]["environment"]
@@ -191,11 +191,11 @@ class Study:
             return values
         is_tuned = unit.setting in HUMANS and unit.scenario in SCENARIOS
         tuned = TUNED.get(unit.algorithm, {}) if is_tuned else {}
-        row, asked = ALGORITHMS[unit.algorithm], dict[str, float]()
+        row, of_task = ALGORITHMS[unit.algorithm], dict[str, float]()
         if period_s := TASKS[unit.scenario].get("numbers_period_s"):
-            asked = task_settings(row, numbers=True, period_s=period_s)
+            of_task = task_settings(row, numbers=True, period_s=period_s)
         factor = here.confirmation_factor
-        confirmed = {"confirmation_factor": factor} if factor else {}  # Records without it are kept
+        confirmed = {"confirmation_factor": factor} if factor else {}  # Keeps old digests
         return {
             **values,
             "seed": unit.seed,
@@ -207,7 +207,7 @@ class Study:
             **setting.get("run", {}),
             **(SHOWN.get(unit.algorithm, {}) if unit.setting in HUMANS else {}),
             "learner": {
-                **asked,
+                **of_task,
                 **row.settings,
                 **tuned,
                 **here.learner,
@@ -216,17 +216,17 @@ class Study:
         }
 
     def run_name(self, unit: Unit) -> str:
-        """Return the directory in which the unit is trained, whatever its tests are."""
+        """Return the name of the unit's training directory; its tests do not change it."""
         return f"{'-'.join(map(str, unit))}-{digest(self.config(unit))}"
 
     def digest(self, unit: Unit) -> str:
-        """Return the digest that a current record has."""
+        """Return the digest of a current record: of training, tests and `RESULTS_VERSION`."""
         tests = {"test_runs": self.of(unit.scenario).test_runs, "version": RESULTS_VERSION}
         return digest({**self.config(unit), **tests})
 
 
 def digest(values: Mapping[str, Any]) -> str:
-    """Hash plain values, whatever the order in which they stand."""
+    """Hash plain values, independent of their order."""
     text = json.dumps(values, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 

@@ -1,8 +1,8 @@
 """``python -m trainer experiment``: compute what is missing of a study, then write its page.
 
-A unit goes from its first step to its record: training, test drives, and what is kept of both.
-Units are computed in processes of this machine or on a Ray cluster. What is killed goes on from its
-last checkpoint, to the same bits.
+A unit is one training with its test drives; the results of both become its record. Units are
+computed in processes of this machine or on a Ray cluster. A killed unit resumes from its last
+checkpoint, and ends with the same bits.
 """
 
 import argparse
@@ -46,7 +46,7 @@ RENAMED = {"total_steps": "end_step", "episode_return": "return", "interventions
 """Column of a run's metrics -> column of the table of episodes."""
 TIMES = ["environment_s", "acting_s", "storing_s", "waiting_s"]
 """Columns of the metrics that add up to the time that a training took."""
-UNLIMITED_EPISODES = 10**6  # So many that steps decide
+UNLIMITED_EPISODES = 10**6  # So many that the budget of steps ends a training
 TOGETHER = 50  # Test drives side by side
 NICENESS = 5  # Keeps the machine usable for others
 
@@ -56,7 +56,7 @@ class Job:
     unit: Unit
     store: Store
     stop_at_s: float = math.inf
-    """Seconds of the epoch after which work stops with the next episode."""
+    """Time (seconds since 1970) after which a training stops at its episode's end."""
     device: str = "cpu"  # Where its learner computes
 
     @property
@@ -73,23 +73,23 @@ def run(arguments: argparse.Namespace) -> int:
     study = next((study for name, study in STUDIES.items() if name in names), plan.PAPER)
     alone = names - plan.EXPERIMENTS.keys()
     if alone and len(names) > 1 and names != {"status", study.name}:
-        raise UserError(f"{', '.join(sorted(alone))}: no other name goes with it")
+        raise UserError(f"{', '.join(sorted(alone))} cannot be combined with other names")
     store = _store(arguments, study)
     row, settings = arguments.algorithm, arguments.setting or plan.SETTINGS
     units = [unit for unit in store.study.units(seeds, arguments.scenario, names)
              if row in (None, unit.algorithm) and unit.setting in settings]  # fmt: skip
     if "status" in names:
-        there = store.load(units, seeds)
-        done = Counter(unit[:3] for unit in there.found)
+        loaded = store.load(units, seeds)
+        done = Counter(unit[:3] for unit in loaded.found)
         for line, count in Counter(unit[:3] for unit in units).items():
             print("{2:10} {1:24} {0:11}".format(*line), f"{done[line]} of {count} done")
-        stale = f"{len(there.stale)} records of other settings"
-        print(f"{len(there.found)} of {len(units)} units done; {stale}")
+        stale = f"{len(loaded.stale)} records of other settings"
+        print(f"{len(loaded.found)} of {len(units)} units done; {stale}")
         return 0
     failed = 0 if "report" in names else compute_missing(arguments, store, units)
-    there = store.load(store.study.units(seeds), seeds)
-    if "report" in names or {*units} & {*there.found}:
-        print(f"wrote {report.write_page(store, there)}")
+    loaded = store.load(store.study.units(seeds), seeds)
+    if "report" in names or {*units} & {*loaded.found}:
+        print(f"wrote {report.write_page(store, loaded)}")
     return 1 if failed else 0
 
 
@@ -116,17 +116,17 @@ def compute_missing(arguments: argparse.Namespace, store: Store, wanted: Sequenc
         for job, end in start:
             ends[end] += 1
             bar.advance({"last": str(job.unit)})
-    said = "".join(f", {count} {end}" for end, count in ends.items())
-    print(f"{len(done)} of {len(wanted)} units were there already{said}")
+    counts = "".join(f", {count} {end}" for end, count in ends.items())
+    print(f"{len(done)} of {len(wanted)} units were done already{counts}")
     if ends[FINISHED] < len(jobs):
         print("the same command goes on")
     return ends[FAILED]
 
 
 def run_here(jobs: Sequence[Job], processes: int = 0) -> Iterator[tuple[Job, str]]:
-    """Compute units in so many processes at a time, 0: one for each core; yield how each ends.
+    """Compute units in ``processes`` processes (0: one per core); yield how each unit ends.
 
-    Raises UserError where a process dies: nothing tells which unit's it was.
+    Raises UserError if a process dies: the pool does not tell which unit it computed.
     """
     pool = ProcessPoolExecutor(
         processes or util.cores(), multiprocessing.get_context("spawn"), util.begin_process,
@@ -136,11 +136,11 @@ def run_here(jobs: Sequence[Job], processes: int = 0) -> Iterator[tuple[Job, str
         work = {pool.submit(compute, job): job for job in jobs}
         for future in as_completed(work):
             if time.time() > work[future].stop_at_s:
-                for each in work:  # A process takes seconds to find out that the time is over.
+                for each in work:  # A process would take seconds to start, only to stop.
                     each.cancel()
             yield work[future], _end(work[future], future.result)
     except BaseException:
-        # Only here: a process that is killed while it waits for work keeps the queue's lock.
+        # Only on errors: a process killed while it waits for work keeps the queue's lock.
         for process in multiprocessing.active_children():
             process.kill()
         raise
@@ -148,7 +148,7 @@ def run_here(jobs: Sequence[Job], processes: int = 0) -> Iterator[tuple[Job, str
 
 
 def _end(job: Job, result: Callable[[], str]) -> str:
-    """Return how a unit ended; an error is one line, with a traceback where it is not ours."""
+    """Return how a unit ended; print an error in one line, after a traceback unless UserError."""
     try:
         return result()
     except CancelledError:
@@ -159,8 +159,8 @@ def _end(job: Job, result: Callable[[], str]) -> str:
         cause = getattr(error, "cause", error)  # Ray wraps it.
         if not isinstance(cause, UserError):
             traceback.print_exception(error)
-        said = f"failed: {job.unit}: {type(cause).__name__}: {cause}"
-        print(" ".join(said.split()), file=sys.stderr, flush=True)
+        text = f"failed: {job.unit}: {type(cause).__name__}: {cause}"
+        print(" ".join(text.split()), file=sys.stderr, flush=True)
     return FAILED
 
 
@@ -180,7 +180,7 @@ def run_on_ray(jobs: Sequence[Job], address: str) -> Iterator[tuple[Job, str]]:
     import edge_runtime
     import trainer
 
-    # Nodes need the libraries; our own code is sent to them.
+    # The nodes need the libraries; our own code is sent to them.
     modules = {"py_modules": [edge_runtime, bridge, trainer]}
     try:
         ray.init(address=address, runtime_env=modules, log_to_driver=False)
@@ -193,16 +193,16 @@ def run_on_ray(jobs: Sequence[Job], address: str) -> Iterator[tuple[Job, str]]:
 
 
 def compute(job: Job) -> str:
-    """Compute a unit from where it stands and write its record; return how that ended.
+    """Compute a unit, resuming it if it was begun, and write its record; return how it ended.
 
-    torch works on one thread: the last bits must not depend on the machine's cores.
+    torch uses one thread: the last bits must not depend on the number of cores.
     """
     torch.set_num_threads(1)
     if time.time() > job.stop_at_s or (job.unit.trained and not _train(job)):
         return STOPPED
     make_directory(job.run_dir)
     write_json(job.run_dir / RECORD_FILE, make_record(job))
-    # The actor stays, for export and for tests to come; what learning needs is large.
+    # The actor is kept for export and later tests; the checkpoint is large.
     (job.run_dir / evaluation.CHECKPOINT_FILE).unlink(missing_ok=True)
     return FINISHED
 
@@ -224,19 +224,19 @@ def run_config(job: Job) -> RunConfig:
 
 
 def _train(job: Job) -> bool:
-    """Train to the budget's end; return whether it was reached."""
+    """Train until the budget of steps is used or time is over; return whether it was used."""
     config, run_dir = run_config(job), job.run_dir
     rows = read_metrics(run_dir)
     over = rows and int(rows[-1]["total_steps"]) >= config.steps
     if over and (run_dir / evaluation.BEST_FILE).is_file():
-        return True  # Trained before; the checkpoint may be gone already.
+        return True  # Trained before; the checkpoint may already be deleted.
     run = TrainingRun(config, run_dir, resume=(run_dir / evaluation.CHECKPOINT_FILE).is_file())
     run.train(deadline_s=time.monotonic() + job.stop_at_s - time.time())
     return run.over
 
 
 def make_record(job: Job) -> Record:
-    """Test a unit, trained or not; return its rows of each table."""
+    """Drive a unit's tests; return its record, the rows of each table."""
     unit, study = job.unit, job.store.study
     tables: dict[str, pd.DataFrame] = {}
     own: dict[str, Any] = {
@@ -255,7 +255,7 @@ def make_record(job: Job) -> Record:
             "tested_actor_at_step": int(rows.total_steps[tested - 1]),
             "training_s": round(rows[TIMES].sum(axis=None)),
         }
-        # Not the job's: the unit may have been trained before.
+        # The run's device, not the job's: the unit may have been trained before.
         device = read_json(job.run_dir / CONFIG_FILE, "settings")["device"]
         policy = str(job.run_dir)
     elif unit.algorithm == plan.CONSTANT:
@@ -282,7 +282,7 @@ def drive_tests(unit: Unit, policy: str, count: int) -> pd.DataFrame:
     for condition in unit.conditions:
         env = make_environment(environment, condition)
         driver: Any = evaluation.load_driver(policy, env)[0]
-        if evaluation.is_expert(policy):  # It has a memory, and drives its own environment only.
+        if evaluation.is_expert(policy):  # An expert has a memory and drives one environment.
             drives = evaluation.drive_episodes(env, driver, seeds, condition)
         else:
             more = range(min(TOGETHER, count) - 1)
@@ -294,7 +294,7 @@ def drive_tests(unit: Unit, policy: str, count: int) -> pd.DataFrame:
 
 
 def _computed_on(device: str) -> dict[str, Any]:
-    """Return what computed: the same settings give other bits elsewhere."""
+    """Return processor and versions: the same settings give other bits elsewhere."""
     return {
         "processor": util.processor_model(),
         "gpu": None if device == "cpu" else torch.cuda.get_device_name(),

@@ -2,10 +2,10 @@
 # Measure what a GPU does for the trainer, in eight minutes: gpu.sh DIRECTORY
 #
 # The directory gets tests.txt, bench.json, and the records of 30 trainings, at most 16 at a time:
-# PHIL-TD3 as in the paper's table, and with four and sixteen updates a step. What fails leaves the
-# rest alone, and makes the status 1. Called again, it goes on.
+# PHIL-TD3 as in the paper's table, and with four and sixteen updates a step. A part that fails does
+# not stop the others; the status is then 1. A second call resumes.
 set -u
-out=$(realpath -m "${1:?the directory that gets what is measured}")
+out=$(realpath -m "${1:?the directory for the results}")
 python=${PYTHON:-.venv/bin/python}
 failed=0 SECONDS=0
 mkdir -p "$out" || exit
@@ -16,7 +16,7 @@ tail -n 1 "$out/tests.txt"
 [ -f "$out/bench.json" ] ||
 	timeout 180 "$python" -m trainer bench --device cuda --out "$out/bench.json" || failed=1
 
-# By MPS processes compute side by side; where it does not serve, they take turns.
+# MPS lets processes compute side by side; without it they take turns.
 mps=$(mktemp -d)  # A short path, as a socket's must be
 trap 'echo quit | CUDA_MPS_PIPE_DIRECTORY=$mps nvidia-cuda-mps-control; rm -r "$mps"' EXIT
 export CUDA_MPS_PIPE_DIRECTORY=$mps CUDA_MPS_LOG_DIRECTORY=$mps

@@ -1,7 +1,7 @@
-"""Records as tidy tables: what runs leave behind, packed files, and one row of numbers a unit.
+"""Records of units as tidy tables: a file per unit, packed tables, and one row of numbers a unit.
 
-A unit leaves a small file in its own directory under ``runs``. The tables in ``results`` are made
-of these: ``pandas.read_csv("results/guidance/units.csv.xz")`` reads one.
+A unit leaves a small file in its directory under ``runs``. They are packed into the tables in
+``results``: ``pandas.read_csv("results/guidance/units.csv.xz")`` reads one.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ WRITING_PATIENCE_S = 60.0
 SUCCESS, DISTANCE, REWARD = "success", "distance_m", "reward"
 ARRIVED_ONLY = ["time_s", "lateral_acceleration_mps2", "longitudinal_acceleration_mps2"]
 """Means of the drives that reach the goal only: a car that crashes at once is quick and smooth."""
-DRIVEN = ["outcome", DISTANCE, REWARD, *ARRIVED_ONLY]  # What is taken of a test drive
+DRIVEN = ["outcome", DISTANCE, REWARD, *ARRIVED_ONLY]  # Columns taken from a test drive
 SCORES = (SUCCESS, REWARD, DISTANCE)
 TABLES: Mapping[str, list[str]] = {
     "episodes": [
@@ -44,15 +44,15 @@ TABLES: Mapping[str, list[str]] = {
     "tests": ["condition", "drives", *SCORES],
     "units": ["digest", "period_s", "training_s"],
 }
-"""Table -> columns that it has at least: a row is a training episode, with the validation at its
-end if there was one; a test condition; a unit. The last table is written last: it says which units
-the others hold."""
+"""Table -> columns that it must have. A row is a training episode, with the validation at its end
+if there was one; a test condition; a unit. The table of units is written last: it lists the units
+that the others hold."""
 TRAINING, ALONE = "in training", "alone"
 """A curve of the training episodes, in which the human helps (the paper's), or of the policy alone,
 on validation seeds."""
 SPENT = ["steps", "episodes", "human_steps", "human_s", "takeovers", "failures"]
-"""What a training, or its beginning, costs; failures are episodes that missed the goal."""
-END_STEPS = 1_500  # What ended within so many steps of the last one is the end of a training
+"""Costs of a training or its beginning; failures are episodes that missed the goal."""
+END_STEPS = 1_500  # Episodes of a training's last so many steps are its end
 LEARNED, WELL = LEVELS
 """Success of the policy alone at which it counts as learned, and as learned well."""
 Numbers = NDArray[np.float64]
@@ -68,7 +68,7 @@ def columns_of(table: pd.DataFrame) -> dict[str, list[Any]]:
 def summarise_tests(scenario: str, drives: pd.DataFrame) -> pd.DataFrame:
     """Return the table of tests, a row for each condition.
 
-    Distances end at the goal: how far the last step goes beyond it only shows the speed.
+    Distances are cut at the goal: the last step's overshoot only shows the speed.
     """
     reached = drives.outcome == GOAL
     distance_m = drives[DISTANCE].clip(upper=FULL_PATH_M.get(scenario, np.inf))
@@ -97,11 +97,11 @@ class Store:
     humans: Path  # Directory with a human model for each scenario
 
     def run_dir(self, unit: Unit) -> Path:
-        """Return where the unit is trained, and its actor stays."""
+        """Return the directory in which the unit is trained and its actor is kept."""
         return self.runs / self.study.run_name(unit)
 
     def load(self, units: Collection[Unit], seeds: int) -> Records:
-        """Return the current records of these units, after packing those that runs have left.
+        """Return the units' current records, after packing new ones from ``runs`` into the tables.
 
         Raises UserError: a record or a table is damaged, or another process keeps writing.
         """
@@ -110,7 +110,7 @@ class Store:
             if not mine:
                 raise UserError(f"{self.results} is held by another process")
             tables = self._tables()
-            if new := self._left(wanted, tables):
+            if new := self._unpacked(wanted, tables):
                 self._pack(tables, new)
                 tables = self._tables()
         known = tables["units"].digest.to_dict()
@@ -119,19 +119,19 @@ class Store:
         current = {name: table[table.index.isin(found)] for name, table in tables.items()}
         return Records(self.study, current, found, stale, seeds)
 
-    def _left(
+    def _unpacked(
         self, wanted: Mapping[Unit, str], tables: Mapping[str, pd.DataFrame]
     ) -> dict[Unit, Record]:
-        """Return the current records that runs have left and that the tables lack."""
-        known, left = tables["units"].digest.to_dict(), dict[Unit, Record]()
+        """Return the current records under ``runs`` that the tables lack."""
+        known, records = tables["units"].digest.to_dict(), dict[Unit, Record]()
         for unit, digest in wanted.items():
             path = self.run_dir(unit) / RECORD_FILE
             if known.get(unit) != digest and path.is_file():
                 record = read_json(path, "record")
                 with util.fitting(f"{path} is no record of a unit"):
                     if record["units"]["digest"] == [digest]:
-                        left[unit] = record
-        return left
+                        records[unit] = record
+        return records
 
     def _tables(self) -> dict[str, pd.DataFrame]:
         """Return all tables, with the unit as their index; empty where there is no file."""
@@ -162,19 +162,19 @@ class Records:
     study: Study
     tables: Mapping[str, pd.DataFrame]
     found: list[Unit]
-    stale: list[Unit]  # Units whose record is of other settings, and left out
-    seeds: int  # How many are wanted
+    stale: list[Unit]  # Units whose record, of other settings, is left out
+    seeds: int  # Number of seeds wanted
 
     def of(self, task: str, line: Line) -> pd.DataFrame:
-        """Return the numbers of a line's units, by seed; what is only tested has seed 0."""
-        its = self.numbers
-        return its[(its.scenario == task) & (its.algorithm == line[0]) & (its.setting == line[1])]
+        """Return the numbers of a line's units, by seed; a line without training has seed 0."""
+        n = self.numbers
+        return n[(n.scenario == task) & (n.algorithm == line[0]) & (n.setting == line[1])]
 
     @cached_property
     def episodes(self) -> pd.DataFrame:
-        """One row a training episode: what was spent by its end, and what was measured.
+        """One row a training episode: the costs up to its end, and its scores.
 
-        Columns of ``SPENT``, and ``success alone`` and the like, NaN where not validated.
+        Costs are the columns of ``SPENT``; a score like ``success alone`` is NaN if not validated.
         """
         rows = self.tables["episodes"]
         full_m = rows.index.get_level_values("scenario").map(lambda task: FULL_PATH_M.get(task))
@@ -194,9 +194,9 @@ class Records:
     def numbers(self) -> pd.DataFrame:
         """One row a unit: its columns of ``units``, its costs, and its tests by condition.
 
-        Costs of a whole training have plain names (``human_s``); ``human_s_to_90%`` is what it
-        took until the policy alone reached that level in validation, infinite where it never did;
-        ``success alone, end`` is a mean of the last ``END_STEPS``.
+        Costs of a whole training have plain names (``human_s``); ``human_s_to_90%`` is the cost
+        until the policy alone reached that level in validation, infinite if it never did;
+        ``success alone, end`` is a mean over the last ``END_STEPS``.
         """
         units, rows = self.tables["units"].sort_index(), self.episodes
         costs = rows[SPENT].astype(float).groupby(KEY).last()
@@ -220,15 +220,15 @@ class Records:
         return numbers.reindex(columns=numbers.columns.union(wanted, sort=False))
 
     def grid(self, task: str) -> Numbers:
-        """Return the steps of a curve's points: multiples of the validations' distance."""
+        """Return the steps of a curve's points: multiples of the validation interval."""
         every = self.study.of(task).evaluate_every_steps
         return np.arange(every, self.study.steps[task] + 1, every, dtype=float)
 
     def curves(self, task: str, line: Line, name: str) -> Numbers:
         """Return a column of ``episodes`` at each point of the grid: [seeds, points].
 
-        In training it is the mean of the episodes since the point before, or of the next one where
-        none ended there; of the policy alone it is interpolated.
+        A training curve is the mean of the episodes since the point before, or the next episode if
+        none ended in between; a curve of the policy alone is interpolated.
         """
         grid = self.grid(task)
 

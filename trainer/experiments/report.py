@@ -1,7 +1,7 @@
-"""Pages of the studies: tables and figures in Python, prose in templates.
+"""Write the studies' pages: tables and figures in Python, prose in templates.
 
-``NAME.md.jinja`` is the page of a study; it calls the functions of this module. A cell of a table
-is made of the numbers of a line's units in one task, one row a unit.
+``NAME.md.jinja`` is the page of a study; it calls the functions of this module. A `Cell` turns the
+numbers of a line's units in one task, one row a unit, into a table's cell.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -31,14 +31,14 @@ from trainer.training.config import PRESETS, flat
 Cell = Callable[[pd.DataFrame], str]
 PHIL = "phil_td3"
 PAIRS = len(plan.SCENARIOS) * plan.DEFAULT_SEEDS
-ENOUGH = 9  # Of these pairs: an equal row has so many by chance in one of 93 cases
-MOST_EPISODES = 100  # In which a row of the table of human guidance is to learn
+ENOUGH = 9  # Pairs to win; an equally good row wins so many by chance in one of 93 cases
+MOST_EPISODES = 100  # A row of the table of human guidance should learn within these
 SCENES = [*product(plan.SCENARIOS, CONDITIONS)]
 PAPER_SCENES = [scene for scene in SCENES if scene[1] != "dense"]
 BESIDE = [Line(row, plan.GOOD) for row in plan.ROWS]
 """The rows of the table of human guidance, beside the scripted expert."""
 OWN = {"model": Line("human_model", "model"), "slower": Line("expert", "slower")}
-"""Humans who drive by themselves; the others are the expert, with a fault or without."""
+"""Humans with a policy of their own; all others are the expert, with or without a fault."""
 
 
 def write_page(store: Store, records: Records) -> Path:
@@ -58,7 +58,7 @@ def write_page(store: Store, records: Records) -> Path:
     templates.filters["listed"] = lambda values: ", ".join(f"`{k}={v}`" for k, v in values.items())
     templates.filters |= {"words": plan.words, "percent": "{:.0%}".format, "number": "{:,}".format}
     templates.filters |= {"label": label, "cell": lambda text: text.replace("|", "/")}
-    claims = store.results / "claims.csv"  # With the verdicts of the kept records
+    claims = store.results / "claims.csv"  # The verdicts on the paper's claims
     text = templates.get_template(f"{name}.md.jinja").render(
         globals(),
         claims=pd.read_csv(claims, keep_default_na=False) if claims.is_file() else None,
@@ -81,21 +81,21 @@ def label(scene: tuple[str, str]) -> str:
 
 
 def table(records: Records, places: Iterable[tuple[str, Line]], columns: Mapping[str, Cell]) -> str:
-    """Return a row for each task and line of which there is something."""
-    found = ((task, line, records.of(task, line)) for task, line in places)
-    rows = [(line.name, plan.words(task), *(cell(its) for cell in columns.values()))
-            for task, line, its in found if len(its)]  # fmt: skip
+    """Return a Markdown table with a row for each task and line that has units."""
+    lines = ((task, line, records.of(task, line)) for task, line in places)
+    rows = [(line.name, plan.words(task), *(cell(units) for cell in columns.values()))
+            for task, line, units in lines if len(units)]  # fmt: skip
     return "\n".join(markdown_table(["", "scenario", *columns], rows)).rstrip("\n")
 
 
 def shown(cell: Cell, records: Records, task: str, line: Line) -> str:
-    """Return a line's cell; a dash where there is no unit."""
+    """Return a line's cell, or a dash if it has no units."""
     rows = records.of(task, line)
     return cell(rows) if len(rows) else "–"
 
 
 def spread(numbers: pd.Series) -> str:
-    """Return median (of an even number the upper middle), least and most, as in "12 [8, ∞]"."""
+    """Return median (upper one of an even count), minimum and maximum, as in "12 [8, ∞]"."""
     ordered = numbers.sort_values()
     ends = (f"{ordered.iloc[place]:,.0f}" for place in (len(ordered) // 2, 0, -1))
     middle, least, most = ("0" if end == "-0" else end.replace("inf", "∞") for end in ends)
@@ -103,19 +103,19 @@ def spread(numbers: pd.Series) -> str:
 
 
 def until(level: float, what: str) -> Cell:
-    """Show a cost until the policy alone reached a level, and how many seeds do if not all.
+    """Show the cost until the policy alone reached a level, and how many seeds did if not all.
 
-    A seed that never does costs more than any other.
+    A seed that never reached it counts as infinite cost.
     """
 
     def cell(rows: pd.DataFrame) -> str:
         costs = rows[f"{what}_to_{level:.0%}"]
-        there = np.isfinite(costs).sum()
+        reached = np.isfinite(costs).sum()
         if what in ("human_s", "takeovers") and not ALGORITHMS[rows.algorithm.iloc[0]].guided:
             return "–"
-        if not there:
+        if not reached:
             return "never"
-        return spread(costs) + (f" ({there} of {len(costs)})" if there < len(costs) else "")
+        return spread(costs) + (f" ({reached} of {len(costs)})" if reached < len(costs) else "")
 
     return cell
 
@@ -130,11 +130,12 @@ def share(condition: str) -> Cell:
 
 
 def estimate(column: str, digits: int = 0, factor: float = 1.0) -> Cell:
-    """Show the mean of what is never below 0, with its interval."""
+    """Show the mean of a column that is never below 0, with its interval."""
 
     def cell(rows: pd.DataFrame) -> str:
-        found = mean_estimate(factor * rows[column])
-        return found._replace(low=max(found.low, 0.0) if found.size > 1 else found.low).text(digits)
+        result = mean_estimate(factor * rows[column])
+        low = max(result.low, 0.0) if result.size > 1 else result.low
+        return result._replace(low=low).text(digits)
 
     return cell
 
@@ -168,7 +169,7 @@ COSTS: Mapping[str, Cell] = {
 
 
 def computed_in(records: Records, algorithms: Iterable[str], settings: Iterable[str]) -> str:
-    """Return how many of the trainings multiplied in what, and where."""
+    """Return the number of trainings by precision and device, such as "3 bfloat16"."""
     units = records.numbers
     units = units[units.algorithm.isin([*algorithms]) & units.setting.isin([*settings])]
     kinds = units.bfloat16.map(lambda fast: "bfloat16" if fast else "float32")
@@ -180,13 +181,13 @@ def computed_in(records: Records, algorithms: Iterable[str], settings: Iterable[
 
 
 def presets() -> list[tuple[str, Any, Any]]:
-    """Return the settings that are not the paper's: name, ours, the paper's."""
+    """Return the settings that differ from the paper's: name, our value, the paper's."""
     ours, printed = (flat(PRESETS[name]) for name in ("ours", "printed"))
     return [(name, ours[name], value) for name, value in printed.items() if value != ours[name]]
 
 
 def tested(condition: str) -> Cell:
-    """Show the success under a condition, and in brackets that on the paper's seeds."""
+    """Show the success under a condition, and in brackets on the paper's seeds alone."""
     paper = mean(f"paper_success {condition}", 0, 100.0)
     return lambda rows: f"{share(condition)(rows)} ({paper(rows)})"
 
@@ -202,7 +203,7 @@ def pooled(condition: str) -> Cell:
 
 
 def seconds(rows: pd.DataFrame) -> str:
-    """Show how long 10,000 steps of training took."""
+    """Show the seconds of 10,000 training steps."""
     return mean_estimate(1e4 * rows.training_s / rows.steps).text(0)
 
 
@@ -215,20 +216,20 @@ def cost(records: Records) -> str:
 
 
 def pairs(records: Records, row: str, tasks: Iterable[str] = plan.SCENARIOS) -> pd.DataFrame:
-    """Return the human's seconds until a row and PHIL-TD3 had learned, pair by pair of seeds."""
-    found = records.numbers[records.numbers.seed <= plan.DEFAULT_SEEDS]
-    found = found[found.scenario.isin([*tasks]) & (found.setting == plan.GOOD)]
-    found = found.pivot(index=["scenario", "seed"], columns="algorithm", values=S_LEARNED)
-    return found.reindex(columns=[row, PHIL]).dropna().set_axis(["own", "phil"], axis=1)
+    """Return the human seconds until a row and PHIL-TD3 had learned, one pair a task and seed."""
+    units = records.numbers[records.numbers.seed <= plan.DEFAULT_SEEDS]
+    units = units[units.scenario.isin([*tasks]) & (units.setting == plan.GOOD)]
+    learned = units.pivot(index=["scenario", "seed"], columns="algorithm", values=S_LEARNED)
+    return learned.reindex(columns=[row, PHIL]).dropna().set_axis(["own", "phil"], axis=1)
 
 
 def less_in(found: pd.DataFrame) -> str:
-    """Return in how many pairs a row needs less of the human than PHIL-TD3."""
+    """Return in how many pairs a row needs fewer human seconds than PHIL-TD3."""
     return f"{(found.own < found.phil).sum()} of {len(found)}"
 
 
 def over(records: Records, rows: pd.DataFrame, other: Line, column: str) -> Estimate:
-    """Return a number less another line's, paired by seed; an untrained line pairs with each."""
+    """Return a column minus another line's, paired by seed; an untrained line pairs with all."""
     theirs = records.of(rows.scenario.iloc[0], other).set_index("seed")[column]
     return mean_estimate(rows.set_index("seed")[column] - theirs.get(0, theirs))
 
@@ -237,22 +238,22 @@ def beside_phil(records: Records) -> Mapping[str, Cell]:
     def points(rows: pd.DataFrame) -> str:
         return over(records, rows, Line(PHIL, plan.GOOD), "success nominal").times(100.0).text(1)
 
-    def of(rows: pd.DataFrame) -> pd.DataFrame:
+    def pairs_of(rows: pd.DataFrame) -> pd.DataFrame:
         return pairs(records, rows.algorithm.iloc[0], [rows.scenario.iloc[0]])
 
     def sooner(rows: pd.DataFrame) -> str:
-        found = of(rows)
-        less = (found.own - found.phil).where(found.own != found.phil, 0.0)
-        return spread(less) if np.isfinite(found).any(axis=None) else "–"
+        both = pairs_of(rows)
+        less = (both.own - both.phil).where(both.own != both.phil, 0.0)
+        return spread(less) if np.isfinite(both).any(axis=None) else "–"
 
     return {"success, nominal, points": points, S_TO_LEARNED: sooner,
-            "less in": lambda rows: less_in(of(rows))}  # fmt: skip
+            "less in": lambda rows: less_in(pairs_of(rows))}  # fmt: skip
 
 
 def default(records: Records) -> str | int:
-    """Return which row is to be the default by the rule on the page.
+    """Return the row that the rule on the page makes the default.
 
-    Where pairs are missing, instead how many there are of one row.
+    While pairs are missing, return instead the number of pairs of the row with the fewest.
     """
     found = {row: pairs(records, row) for row in plan.RIVALS}
     if (fewest := min(map(len, found.values()))) < PAIRS:
@@ -270,7 +271,7 @@ def default(records: Records) -> str | int:
 
 
 def late(records: Records) -> list[str]:
-    """Return which rows get there in good time in every seed of none of our scenes."""
+    """Return the rows that learn within ``MOST_EPISODES`` in all seeds in neither of our scenes."""
 
     def in_time(task: str, line: Line) -> bool:
         return records.of(task, line)[f"episodes_to_{data.LEARNED:.0%}"].max() <= MOST_EPISODES
@@ -279,7 +280,7 @@ def late(records: Records) -> list[str]:
 
 
 def forgives(records: Records) -> tuple[list[str], list[str]]:
-    """Return which rows succeed beside each human in the left turn, and which beside some not."""
+    """Return the rows that succeed with every human in the left turn, and those that do not."""
     good, less = list[str](), list[str]()
     for row in plan.HELPED:
         found = {human: records.of("left_turn", Line(row, human)) for human in plan.HUMANS}
@@ -294,7 +295,7 @@ def forgives(records: Records) -> tuple[list[str], list[str]]:
 
 
 def outcomes(records: Records) -> Mapping[str, Cell]:
-    """Return the columns of what came of a training."""
+    """Return the columns with the results of a training."""
 
     def less_the_humans(rows: pd.DataFrame) -> str:
         trained = rows.algorithm.iloc[0] in ALGORITHMS
@@ -381,7 +382,7 @@ def draw_points(name: str, quantities: list[tuple[str, str]], records: Records) 
 
 
 def draw_guidance(records: Records) -> Figure:
-    """Draw a panel a task, a dot a seed: the human's seconds until a row learned, its success."""
+    """Draw human seconds until a row learned, and its success: a panel a task, a dot a seed."""
     figure = Figure(figsize=(3.3 * len(plan.TASKS) + 1.5, 7.0), layout="constrained")
     panels = figure.subplots(2, len(plan.TASKS), sharey=True)
     heights = dict(zip(plan.ROWS, -np.arange(len(plan.ROWS)), strict=True))
@@ -429,4 +430,4 @@ FIGURES: Mapping[str, Mapping[str, Draw]] = {
     },
     "guidance": {"guidance": draw_guidance},
 }  # fmt: skip
-"""Study -> name of a figure's file, and of the experiment -> how it is drawn."""
+"""Study -> name of the figure's file, often an experiment's -> function that draws it."""
