@@ -17,8 +17,8 @@ class RacetrackExpert:
 
     AHEAD_S, CENTRE_PER_S, HEADING_PER_S, TOWARDS = 0.2, 1.0, 3.0, 0.35
     OFFSET_M, HEADING_RAD, ROOM_M = 1.6, 0.5, 17.0
-    """The policy's limits: offset from the middle, angle to the lane, distance to a car ahead, of
-    which it sees 18 m."""
+    """Limits for the policy: offset from the middle, angle to the lane, distance to a car ahead (it
+    sees 18 m ahead)."""
 
     def __init__(self, env: Any) -> None:
         self.env = env
@@ -35,7 +35,7 @@ class RacetrackExpert:
         return np.clip([angle_rad / FULL_STEERING_RAD], -1.0, 1.0)
 
     def wants_control(self, policy_action: np.ndarray) -> str | None:
-        """Return why it takes over, or None where the policy steers as it would."""
+        """Return the reason to take over, or None, as where the policy steers like the expert."""
         if abs(float(policy_action[0]) - float(self.act()[0])) < 0.2:
             return None
         car, lane = self.env.vehicle, self._lane()
@@ -47,7 +47,7 @@ class RacetrackExpert:
         return "offset" if abs(aside_m) > self.OFFSET_M else None
 
     def _lane(self) -> Any:
-        """Return the car's lane, or a free lane beside it if the car's is not free."""
+        """Return the car's lane, or a free one beside it if that is not free."""
         car, network = self.env.vehicle, self.env.road.network
         lanes = [car.lane_index, *network.side_lanes(car.lane_index)]
         free = [index for index in lanes if self._is_free(network.get_lane(index))]

@@ -12,14 +12,14 @@ from stable_baselines3 import SAC, TD3, HerReplayBuffer
 
 
 def train(name: str, algorithm: str, steps: int, seed: int) -> Any:
-    """Train a model; with hindsight if the observation holds a goal."""
+    """Train a model, with hindsight replay if the observation is a Dict with a goal."""
     environment = gymnasium.make(name)
-    seen = environment.observation_space
+    space = environment.observation_space
     options: dict[str, Any] = {"policy": "MlpPolicy", "learning_rate": 1e-3, "seed": seed}
-    if isinstance(seen, gymnasium.spaces.Dict):
+    if isinstance(space, gymnasium.spaces.Dict):
         options |= {"policy": "MultiInputPolicy", "replay_buffer_class": HerReplayBuffer}
         options |= {"gamma": 0.95, "tau": 0.05, "learning_starts": 1000}
-    elif seen.dtype == "uint8" and len(seen.shape or ()) == 3:  # Pictures
+    elif space.dtype == "uint8" and len(space.shape or ()) == 3:  # Pictures
         options |= {"policy": "CnnPolicy", "buffer_size": 10_000, "learning_rate": 3e-4}
     kind = {"td3": TD3, "sac": SAC}[algorithm]
     return kind(env=environment, device="cpu", **options).learn(steps)
@@ -32,5 +32,5 @@ if __name__ == "__main__":
     parser.add_argument("--steps", type=int, default=6000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", required=True, metavar="MODEL.zip")
-    asked = parser.parse_args()
-    train(asked.environment, asked.algorithm, asked.steps, asked.seed).save(asked.out)
+    args = parser.parse_args()
+    train(args.environment, args.algorithm, args.steps, args.seed).save(args.out)

@@ -1,7 +1,7 @@
-"""A camera as a robot's senses: a USB camera by OpenCV, or a folder of pictures in its place.
+"""Observe by a USB camera (OpenCV), or by a folder of pictures in its place.
 
-`python -m my_camera` draws such a folder: a line that winds over dark ground. It is Python 3.8, for
-the board; my_task.py is for the training.
+`python -m my_camera` draws such pictures: a line that winds over dark ground. This file runs on the
+board, in Python 3.8; my_task.py is for the training.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ DEVICE, FOLDER = os.environ.get("MY_CAMERA", "0"), Path(os.environ.get("MY_PICTU
 
 
 class Stacked:
-    """Makes of pictures [45, 80] what the policy sees: `frames`, [t-1, t]."""
+    """Stacks pictures [45, 80] to the policy's observation: `frames`, [t-1, t]."""
 
     last: np.ndarray | None = None
 
     def observe(self) -> dict[str, np.ndarray]:
-        """Take the picture of now; it must be taken after this was called."""
+        """Take a new picture, exposed after the call, and stack it with the last one."""
         picture = self.take()
         last, self.last = picture if self.last is None else self.last, picture
         return {"frames": np.stack([last, picture])}
@@ -37,23 +37,23 @@ class Camera(Stacked):
 
         self.cv2 = cv2
         self.camera = cv2.VideoCapture(int(DEVICE) if DEVICE.isdecimal() else DEVICE)
-        self.came, self.count, self.frame = threading.Condition(), 0, None
+        self.arrived, self.count, self.frame = threading.Condition(), 0, None
         threading.Thread(target=self.read, daemon=True).start()
 
     def read(self) -> None:
-        """Take every frame: OpenCV queues those that nobody takes, and they grow old."""
+        """Read every frame: OpenCV queues unread ones, and they grow old."""
         good = True
         while good:
             good, frame = self.camera.read()
-            with self.came:
+            with self.arrived:
                 self.count, self.frame = self.count + 1, frame if good else None
-                self.came.notify()
+                self.arrived.notify()
 
     def take(self) -> np.ndarray:
-        """Wait for the second frame from now: the first one was begun before."""
-        with self.came:
+        """Wait for the second frame from now: the exposure of the first began before the call."""
+        with self.arrived:
             enough = self.count + 2
-            self.came.wait_for(lambda: self.count >= enough or (self.count and self.frame is None))
+            self.arrived.wait_for(lambda: self.count >= enough or (self.count and self.frame is None))
             frame = self.frame
         if frame is None:
             raise OSError(f"camera {DEVICE} gives no frame")
@@ -62,7 +62,7 @@ class Camera(Stacked):
 
 
 class Pictures(Stacked):
-    """The pictures of the folder MY_PICTURES, by name, again and again."""
+    """The pictures of the folder MY_PICTURES, sorted by name, in a loop."""
 
     def __init__(self) -> None:
         from PIL import Image
@@ -84,8 +84,8 @@ def draw(folder: Path = FOLDER, count: int = 200) -> None:
     folder.mkdir()
     for number in range(count):
         image = Image.new("L", (4 * WIDTH, 4 * HEIGHT), 40)
-        ways = [(160 + 60 * math.sin(number / 8 + y / 90) * (1 - y / 400), y) for y in range(181)]
-        ImageDraw.Draw(image).line(ways, 220, 16)
+        line = [(160 + 60 * math.sin(number / 8 + y / 90) * (1 - y / 400), y) for y in range(181)]
+        ImageDraw.Draw(image).line(line, 220, 16)
         image.save(folder / f"{number:04d}.png")
 
 

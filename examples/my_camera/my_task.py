@@ -1,6 +1,6 @@
-"""What a policy of the camera sees and does, as an environment that shows the folder of pictures.
+"""Describe the camera policy's observation and action, as an environment of the recorded pictures.
 
-Only a training needs it, and nothing moves in it: what is learned is what a person did.
+Only a training needs it. Nothing moves in it: the policy learns a person's recorded actions.
 """
 
 import gymnasium
@@ -14,12 +14,12 @@ TASK = "mine/Camera-v0"
 
 
 class CameraTask(gymnasium.Env):
-    """The pictures go by, whatever is done; there is no reward."""
+    """Shows the pictures in order, whatever the action; there is no reward."""
 
     control_period_s = 0.1
     observation_name, action_names = "frames", ("pedal", "steering")
     brake_action = (-1.0, 0.0)
-    # The robot itself, a Hunter 2.0, driven gently: so its scale is 1.
+    # The driven car is the robot itself, a Hunter 2.0 driven gently: so its scale is 1.
     car = Car(
         throttle_mps2=1.0, brake_mps2=2.0, max_speed_mps=1.5, full_steering_rad=0.38,
         wheelbase_m=0.65,
@@ -36,7 +36,7 @@ class CameraTask(gymnasium.Env):
         return self.source.observe()["frames"], 0.0, False, False, {}
 
     def expert(self) -> "Nobody":
-        """Make the human who never takes over: the person's drives are recorded."""
+        """Make a human who never takes over: the person's drives are recorded already."""
         return Nobody()
 
 

@@ -31,7 +31,7 @@ class Dock(gymnasium.Env):
         super().reset(seed=seed)
         self.start_m = self.distance_m = self.np_random.uniform(6.0, 10.0)
         self.speed_mps = 0.0
-        return self._seen(), self._info()
+        return self._observation(), self._info()
 
     def step(self, action):  # type: ignore[no-untyped-def]
         """Roll on for 0.1 s; no cart rolls back."""
@@ -42,7 +42,7 @@ class Dock(gymnasium.Env):
         if docked:
             info["outcome"] = "goal" if gentle else "collision"
         reward = (10.0 if gentle else -10.0) if docked else -0.05
-        return self._seen(), reward, docked, False, info
+        return self._observation(), reward, docked, False, info
 
     def render(self) -> np.ndarray:
         """Draw the cart and the dock, uint8 [60, 240, 3]."""
@@ -55,7 +55,7 @@ class Dock(gymnasium.Env):
     def expert(self) -> "Expert":
         return Expert(self)
 
-    def _seen(self) -> np.ndarray:
+    def _observation(self) -> np.ndarray:
         return np.array([self.distance_m, self.speed_mps], np.float32)
 
     def _info(self) -> dict:
@@ -63,7 +63,7 @@ class Dock(gymnasium.Env):
 
 
 class Expert:
-    """Drives from the true state, and takes over from a cart that is too fast, or waits."""
+    """Drives from the true state, and takes over if the cart is too fast or waits."""
 
     def __init__(self, env: Dock) -> None:
         self.env = env

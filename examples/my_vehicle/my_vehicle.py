@@ -1,7 +1,7 @@
-"""A driver for a rover that speaks UDP, and (`python -m my_vehicle`) such a rover of arithmetic.
+"""A driver for a rover that speaks UDP, and (`python -m my_vehicle`) a simulation of that rover.
 
-Each datagram to the rover is `pedal steering seconds`: what to do, and for how long. After that it
-brakes by itself, so this driver needs no thread. It answers `speed pedal steering braking`.
+A command is the datagram `pedal steering seconds`; after these seconds the rover brakes by itself,
+so this driver needs no thread. It answers each datagram, also `?`: `speed pedal steering braking`.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Rover(Vehicle):
     def command(
         self, action: dict[str, float], now_s: float, scenario_speed_mps: float | None = None
     ) -> None:
-        """Drive, unless it is stopped; refuse what is no command even then."""
+        """Drive if enabled; raise ValueError for an invalid command in any case."""
         if "pedal" not in action or not all(map(math.isfinite, action.values())):
             raise ValueError(f"a rover needs a pedal, and finite numbers: {action}")
         if self._enabled:
@@ -58,7 +58,7 @@ class Rover(Vehicle):
         self._send(-1.0, 0.0)
 
     def feedback(self, now_s: float) -> VehicleReport:
-        """Report by the newest answer. The runtime stops for an error as for silence."""
+        """Report the newest answer; the runtime stops for an exception as for silence."""
         self._socket.send(b"?")
         self._unanswered += 1
         with contextlib.suppress(BlockingIOError):
@@ -80,22 +80,22 @@ class Rover(Vehicle):
 
 
 def be_a_rover(port: int = 7450) -> None:
-    """Move by 3 m/s2 at full pedal, 2 m/s at most."""
+    """Simulate the rover: 3 m/s2 at full pedal, 2 m/s at most."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as bound:
         bound.bind(("127.0.0.1", port))
         speed_mps, pedal, steering, then_s, until_s = 0.0, -1.0, 0.0, time.monotonic(), 0.0
         while True:
-            asked, peer = bound.recvfrom(100)
+            datagram, peer = bound.recvfrom(100)
             now_s = time.monotonic()
             for end_s, held in ((min(until_s, now_s), pedal), (now_s, -1.0)):
                 step_s, then_s = max(0.0, end_s - then_s), max(end_s, then_s)
                 speed_mps = min(max(speed_mps + 3.0 * held * step_s, 0.0), 2.0)
-            if asked != b"?":
-                pedal, steering, seconds = map(float, asked.split())
+            if datagram != b"?":
+                pedal, steering, seconds = map(float, datagram.split())
                 until_s = now_s + seconds
             braking = now_s >= until_s
-            told = f"{speed_mps} {-1.0 if braking else pedal} {steering} {int(braking)}"
-            bound.sendto(told.encode(), peer)
+            answer = f"{speed_mps} {-1.0 if braking else pedal} {steering} {int(braking)}"
+            bound.sendto(answer.encode(), peer)
 
 
 if __name__ == "__main__":
