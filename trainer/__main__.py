@@ -249,10 +249,8 @@ def plot(parser: argparse.ArgumentParser) -> None:
 
 def add_scenario(parser: Group, known: str = "") -> None:
     """Add ``--scenario``; ``known`` describes a default that is not ``left_turn``."""
-    text = (
-        f"environment: {', '.join(scenarios())}, a gymnasium id such as Pendulum-v1, or MODULE:ID "
-    )
-    text += "(MODULE is imported first)"
+    text = f"environment: {', '.join(scenarios())}, a gymnasium id such as Pendulum-v1, "
+    text += "or MODULE:ID (MODULE is imported first)"
     text += f" (default: {known}, else left_turn)" if known else ""
     default = None if known else "left_turn"
     parser.add_argument("--scenario", default=default, metavar="NAME", help=text)

@@ -37,7 +37,7 @@ class Camera(Stacked):
 
         self.cv2 = cv2
         self.camera = cv2.VideoCapture(int(DEVICE) if DEVICE.isdecimal() else DEVICE)
-        self.arrived, self.count, self.frame = threading.Condition(), 0, None
+        self.ready, self.count, self.frame = threading.Condition(), 0, None
         threading.Thread(target=self.read, daemon=True).start()
 
     def read(self) -> None:
@@ -45,15 +45,15 @@ class Camera(Stacked):
         good = True
         while good:
             good, frame = self.camera.read()
-            with self.arrived:
+            with self.ready:
                 self.count, self.frame = self.count + 1, frame if good else None
-                self.arrived.notify()
+                self.ready.notify()
 
     def take(self) -> np.ndarray:
         """Wait for the second frame from now: the exposure of the first began before the call."""
-        with self.arrived:
+        with self.ready:
             enough = self.count + 2
-            self.arrived.wait_for(lambda: self.count >= enough or (self.count and self.frame is None))
+            self.ready.wait_for(lambda: self.count >= enough or (self.count and self.frame is None))
             frame = self.frame
         if frame is None:
             raise OSError(f"camera {DEVICE} gives no frame")
