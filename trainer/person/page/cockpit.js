@@ -7,7 +7,7 @@ import { drawFrames, drawPicture, drawScene, History } from "./scene.js";
 
 const byId = (id) => document.getElementById(id);
 const STEP_MS = 1000 / 60;
-const STALE_MS = 1000; // without a new view the trainer is busy, and says so
+const STALE_MS = 1000; // without a view for this long, the page says that it waits
 const WHO = {
   waiting: ["Nobody drives yet", "the trainer is starting"],
   lost: ["Connection lost", "you have let go; looking for the trainer"],
@@ -21,15 +21,15 @@ const LINK = { connecting: "connecting", live: "connected", lost: "connection lo
 let view = null;
 let viewMs = 0;
 let driving = true; // and not watching
-let refused = false; // held since before the connection, or the wheel, was this page's
+let refused = false; // the hold began before this page was connected, or drove
 const changed = () => link?.changed();
 const wish = (word) => link?.wish(word);
 const keyboard = new Keyboard(changed, wish);
 const touch = new Pad(byId("pad"), byId("knob"), changed);
 const choices = Object.keys(FIELDS).map((id) => [id, byId(id)]);
 const gamepads = new Gamepads({ ...Object.fromEntries(choices), name: byId("pad-name") }, changed, wish);
-// A finger goes before a key, a key before a device that may only lie there. To a hidden page the
-// browser tells nothing new of any of them.
+// A finger has priority over a key, a key over a device that may lie idle. A hidden page gets no
+// input events.
 const hands = {
   now: () => document.hidden ? OFF
     : [touch, keyboard, gamepads].map((hand) => hand.now()).find((said) => said.engaged)
@@ -40,7 +40,7 @@ const frames = [...document.querySelectorAll("#frames canvas")];
 const link = new Link(hands, { view: see, echo: hearEcho, state: showState });
 let lastMs = performance.now();
 setInterval(step, STEP_MS);
-// Without the focus a page hears neither key nor finger come up, and under a menu no key.
+// A page without focus gets no keyup and no pointerup; under a context menu it gets no keyup.
 for (const gone of ["blur", "pagehide", "visibilitychange"]) {
   addEventListener(gone, () => [touch, keyboard].forEach((hand) => hand.release()));
 }
@@ -68,7 +68,7 @@ function see(next) {
   show();
 }
 
-// A hidden page gets no animation frame, and is not to draw all that it missed at once.
+// A hidden page gets no animation frames, and must not draw all missed views at once.
 function show() {
   if (document.hidden) link.drew(view.number);
   else requestAnimationFrame(draw);
@@ -169,7 +169,7 @@ byId("full-screen").hidden = !document.fullscreenEnabled; // as on iPhones
 byId("full-screen").addEventListener("click", () => document.fullscreenElement
   ? document.exitFullscreen() : document.documentElement.requestFullscreen());
 
-// Which key does what, a part each: a line breaks between them.
+// What each key does, in parts between which a line may break.
 function help({ keys, rest, names }) {
   const held = {};
   for (const [key, added] of Object.entries(keys)) {

@@ -1,7 +1,7 @@
 // The browser's Gamepad API: any axis, pedal or trigger as the action, any button as the hold.
 //
-// The action is what pushes to the plus less what pushes to the minus; a stick or a wheel is both
-// in one axis, a pair of pedals is two.
+// The action is the plus input less the minus input. A stick or a wheel has both in one axis; a
+// pair of pedals is two inputs.
 
 import { list, mix, OFF, shares, ways } from "./hands.js";
 
@@ -10,7 +10,7 @@ const WHEEL = /wheel|racing|driving force|\b[gt]\d{2,3}\b/i; // in the device's 
 const WISHES = { 8: "restart", 9: "pause" }; // back or share, start or options: of most gamepads, and of a G29
 const MOVING = "moving"; // instead of a button: moving the wheel takes over, letting it rest hands control back
 
-// What is chosen, and the property of its control that holds it.
+// The choices, and the property of the form's control that holds each.
 export const FIELDS = {
   plus: "value", minus: "value", dead: "valueAsNumber", full: "valueAsNumber", invert: "checked",
   hold: "value",
@@ -59,7 +59,7 @@ export class Gamepads {
     this.form = form;
     this.changed = changed;
     this.wish = wish;
-    this.down = {}; // number of a button -> whether it was pressed; empty for a device that is new
+    this.down = {}; // number of a button -> whether it was pressed; empty for a new device
     this.scenario = this.controls = null;
     this.pad = null;
     this.said = OFF;
@@ -69,7 +69,7 @@ export class Gamepads {
     }
   }
 
-  // Look at the device; once an animation frame or so.
+  // Read the device, about 60 times a second.
   step() {
     if (!this.scenario) return;
     // Absent where the page came over plain http from another machine.
@@ -93,8 +93,8 @@ export class Gamepads {
     }
   }
 
-  // What is chosen presses left and right, or up and down where there is no aside. Of a device
-  // that does both, the pedals are those of its preset.
+  // The chosen inputs press left and right, or up and down in an environment without left and
+  // right. In one with both, the pedals of the preset press up and down.
   said_by(pad) {
     const said = read(pad, this.choice);
     const { aside, along } = ways(this.controls);
@@ -137,7 +137,7 @@ function kept() {
   try {
     return JSON.parse(localStorage.getItem(KEPT)) ?? {};
   } catch {
-    return {}; // somebody else's, or forbidden
+    return {}; // not ours, or storage is forbidden
   }
 }
 

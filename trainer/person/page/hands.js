@@ -1,8 +1,8 @@
 // Keyboard and sliding pad. A held key or finger takes over; letting go hands control back.
 
-// Which keys there are, and what each adds to hands off, comes with a view: ``controls``, as in
-// ``Controls`` of trainer/person/web.py. An action is one number, or a list of several.
-const FIRST_S = 0.1; // what a press is worth at once
+// A view brings ``controls``: the keys, and what each adds to the action at rest; see ``Controls``
+// of trainer/person/web.py. An action is one number, or a list of several.
+const FIRST_S = 0.1; // a press counts at once as if held for this long
 const HOLD = "space";
 const WISHES = {
   KeyP: "pause", KeyR: "restart", Backspace: "discard", KeyQ: "quit", KeyY: "succeeded", KeyN: "failed",
@@ -22,22 +22,22 @@ export function mix(controls, shares) {
   return plain(added.map(clip));
 }
 
-// Whether an environment is driven aside, and whether up and down.
+// Whether an environment has keys for left and right, and for up and down.
 export const ways = (controls) => ({ aside: "left" in controls.keys, along: "up" in controls.keys });
 
 export class Keyboard {
   constructor(changed, wish) {
     this.controls = null; // until the first view: nothing is driven
     this.down = new Set();
-    this.pressed = []; // what the keys add to hands off
+    this.pressed = []; // what the keys add to the action at rest
     this.changed = changed;
     addEventListener("keydown", (event) => {
-      if (event.metaKey) this.release(); // of a key that comes up beside it a Mac says nothing
+      if (event.metaKey) this.release(); // macOS sends no keyup while Meta is held
       if (event.ctrlKey || event.altKey || event.metaKey || typing(event.target)) return;
       if (event.code in WISHES && !event.repeat) return wish(WISHES[event.code]);
       const key = keyOf(event.code);
       if (!this.drives(key)) return;
-      event.preventDefault(); // neither scroll, nor press the button that was clicked last
+      event.preventDefault(); // do not scroll, or press the button that was clicked last
       if (event.repeat) return;
       this.down.add(key);
       this.pressed = this.way().map((way, i) => {
@@ -60,7 +60,7 @@ export class Keyboard {
     return key === HOLD || key in this.controls.keys;
   }
 
-  // How far the keys that are held want to go from hands off.
+  // The offset from rest that the held keys lead to.
   way() {
     if (!this.controls) return [];
     const held = Object.fromEntries([...this.down].map((key) => [key, 1]));
@@ -76,7 +76,7 @@ export class Keyboard {
     return this.controls !== null && [...this.down].some((key) => this.drives(key));
   }
 
-  // Grow towards what is held, fall back to nothing without.
+  // Move towards the held keys' offset, or back to rest without any.
   step(seconds) {
     const by = this.perSecond() * seconds;
     const next = this.way().map((way, i) => {
@@ -130,7 +130,7 @@ export class Pad {
 
   move(event) {
     if (event.pointerId !== this.finger) return;
-    if (!event.buttons) return this.release(); // it came up unheard
+    if (!event.buttons) return this.release(); // the pointerup was missed
     const box = this.element.getBoundingClientRect();
     const along = 1 - (2 * (event.clientY - box.top)) / box.height;
     const aside = (2 * (event.clientX - box.left)) / box.width - 1;
@@ -160,7 +160,7 @@ export class Pad {
   }
 }
 
-// A place of a stick, a wheel or a finger as keys that are pressed so far.
+// Convert the place of a stick, a wheel or a finger to shares of key presses.
 export function shares({ aside = 0, along = 0 }) {
   const part = (value) => Math.max(value, 0);
   return { left: part(-aside), right: part(aside), up: part(along), down: part(-along) };

@@ -1,4 +1,4 @@
-// The WebSocket: says what the hands do, hears views and echoes, and comes back when it is lost.
+// The WebSocket: sends the input, receives views and echoes, and reconnects after a loss.
 
 import { OFF } from "./hands.js";
 
@@ -6,10 +6,10 @@ const HEARTBEAT_MS = 100;
 const LEAST_MS = 1000 / 60; // between two inputs
 const SILENCE_MS = 500; // the trainer counts this as letting go, and so does the page
 const RETRY_MS = 500;
-const GONE_MS = 2000; // a socket that long silent is given up for a new one
+const GONE_MS = 2000; // a socket silent for this long is replaced
 
 export class Link {
-  // hands: now() says what they do; on: {view, echo, state} are called back.
+  // hands: now() returns the input; on: the callbacks {view, echo, state}.
   constructor(hands, on) {
     this.hands = hands;
     this.on = on;
@@ -27,12 +27,12 @@ export class Link {
   open() {
     const url = new URL("socket", location.href);
     url.protocol = "ws:";
-    clearTimeout(this.retry); // one connection at a time: `beat` may have been quicker
+    clearTimeout(this.retry); // one connection at a time: `beat` may have opened one
     this.socket = new WebSocket(url);
     this.heardMs = performance.now();
     this.socket.onopen = () => {
       this.seen = 0;
-      this.wishes = []; // pressed while nobody was there to hear it
+      this.wishes = []; // pressed while disconnected
       this.opened ? this.say() : this.greet();
       this.opened = true;
     };
@@ -43,7 +43,7 @@ export class Link {
     };
   }
 
-  // Closing waits for an answer that will not come: what the old socket says is heard no more.
+  // Ignore the old socket from now on: closing it waits for an answer that will not come.
   abandon() {
     this.socket.onopen = this.socket.onmessage = this.socket.onclose = null;
     this.socket.close();
@@ -65,7 +65,7 @@ export class Link {
     }
   }
 
-  // The next view waits for this word.
+  // Acknowledge a view; the trainer then sends the next one.
   drew(number) {
     this.seen = number;
     this.changed();
@@ -76,8 +76,8 @@ export class Link {
     this.changed();
   }
 
-  // The hands moved: say so now, or as soon as the 60 a second allow; taking and letting go at once,
-  // and each place of a wheel, which is read no more often.
+  // The input changed: send it now, or once the limit of 60 a second allows. Taking over, letting
+  // go and each place of a wheel, which is read no more often, are sent at once.
   changed() {
     this.dirty = true;
     const { engaged, by_moving } = this.hands.now();

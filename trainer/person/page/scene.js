@@ -9,13 +9,13 @@ const COLOURS = {
   traffic: "#eb8c28",
   glass: "rgba(10, 12, 15, 0.75)",
 };
-// The colours of what decides are the same in every view: colours.css has them.
+// The colours of policy and human are the same in every view: colours.css has them.
 const colour = (name) => getComputedStyle(document.body).getPropertyValue(`--${name}`);
 const [WIDTH_M, HEIGHT_M, VIEW] = [46, 25, [-30, -7]]; // as in trainer/scenarios/picture.py
 const GOAL_HALF_M = 2.0;
 const HISTORY_STEPS = 100;
 
-// A canvas as sharp as the screen; returns its pen with the scale in its units.
+// Size a canvas for the screen's resolution; return its context, scaled to CSS pixels.
 function sharp(canvas, width, height) {
   const ratio = devicePixelRatio || 1;
   const [w, h] = [Math.round(width * ratio), Math.round(height * ratio)];
@@ -25,7 +25,7 @@ function sharp(canvas, width, height) {
   return pen;
 }
 
-// Where the ground shown begins, m: as the scene says, or around an ego car outside.
+// The upper left corner of the view, m: the scene's own, or around an ego car that has left it.
 function corner({ view, vehicles }) {
   const [left, top] = VIEW;
   const inside = ({ x, y }) => x >= left && x <= left + WIDTH_M && y >= top && y <= top + HEIGHT_M;
@@ -58,7 +58,7 @@ export function drawScene(canvas, view) {
   for (const car of scene.vehicles) drawCar(pen, car, view.control);
 }
 
-// What an environment draws that has no scene: a JPEG in base64.
+// Draw the picture, a JPEG in base64, of an environment without a scene.
 export function drawPicture(canvas, base64) {
   const image = new Image();
   image.onload = () => {
