@@ -75,7 +75,7 @@ def measure(device: str = "cpu", batch_size: int = LearnerConfig.batch_size) -> 
 
 
 def in_turn(contenders: dict[str, Callable[[], int]]) -> dict[str, float]:
-    """Call contenders by turns; return median seconds per piece. A call returns its pieces."""
+    """Call contenders by turns; return median seconds a piece. A call returns its piece count."""
     times: dict[str, list[float]] = {name: [] for name in contenders}
     for _ in range(1 + ROUNDS):
         for name, work in contenders.items():

@@ -280,8 +280,8 @@ class LearnerConfig:
     the paper. Without it the policy saturates before the critic knows anything, and its gradient
     vanishes."""
     precision: str = "bfloat16"
-    """Of the products in convolutions and first connected layers while learning: float32, or
-    bfloat16 where the processor multiplies it faster. Acting is always float32."""
+    """Precision of convolutions and first connected layers while learning: float32, or bfloat16
+    where the processor multiplies it faster. Acting is always float32."""
 
     def __post_init__(self) -> None:
         check_ranges(self, RANGES)
