@@ -123,15 +123,14 @@ class Numbers(nn.Module):
 
     def fit(self, numbers: Tensor) -> None:
         """Scale by the mean and standard deviation of numbers [n, ...]; constants stay."""
-        seen = self._by_channel(numbers).double()
-        spread, mean = torch.std_mean(seen, (0, 2))
+        spread, mean = torch.std_mean(self._by_channel(numbers).double(), (0, 2))
         spread, varies = torch.maximum(spread.float(), self.least), spread > 0.0
         self.middle.copy_(torch.where(varies, mean.float(), self.middle.cpu()))
         self.reach.copy_(torch.where(varies, spread, self.reach.cpu()))
 
     def forward(self, numbers: Tensor) -> Tensor:
-        seen = self._by_channel(numbers).float()
-        scaled = (seen - self.middle[:, None]) / self.reach[:, None]
+        by_channel = self._by_channel(numbers).float()
+        scaled = (by_channel - self.middle[:, None]) / self.reach[:, None]
         return scaled.clamp(-MOST_SPREADS, MOST_SPREADS).flatten(1)
 
     def _by_channel(self, numbers: Tensor) -> Tensor:
@@ -170,15 +169,15 @@ class Convolutions(nn.Module):
         if self.numbers is not None:
             self.numbers.fit(self._channels_first(grids))
 
-    def forward(self, seen: Tensor) -> Tensor:
-        seen = self._channels_first(seen)
-        scaled = seen.float() / 255.0 if self.numbers is None else self.numbers(seen)
+    def forward(self, grids: Tensor) -> Tensor:
+        grids = self._channels_first(grids)
+        scaled = grids.float() / 255.0 if self.numbers is None else self.numbers(grids)
         return self.layers(scaled.reshape(-1, *self.shape))
 
-    def _channels_first(self, seen: Tensor) -> Tensor:
+    def _channels_first(self, grid: Tensor) -> Tensor:
         # Copied: otherwise gradients get the observation's strides, which a fused Adam mistakes for
         # the weights'.
-        return seen.permute(0, 3, 1, 2).contiguous() if self.last else seen.reshape(-1, *self.shape)
+        return grid.permute(0, 3, 1, 2).contiguous() if self.last else grid.reshape(-1, *self.shape)
 
 
 class Entries(nn.Module):
@@ -190,8 +189,8 @@ class Entries(nn.Module):
         self.features = sum(part.features for part in parts)
 
     def forward(self, *entries: Tensor) -> Tensor:
-        seen = zip(self.parts, entries, strict=True)
-        return torch.cat([part(entry).float() for part, entry in seen], 1)
+        pairs = zip(self.parts, entries, strict=True)
+        return torch.cat([part(entry).float() for part, entry in pairs], 1)
 
 
 def make_trunk(space: Space[Any], frames: int) -> Any:
@@ -208,11 +207,11 @@ def make_trunk(space: Space[Any], frames: int) -> Any:
 
 def fit_numbers(network: nn.Module, observations: NDArray[Any]) -> None:
     """Fit the scales of a network's input numbers to observations [n, ...]."""
-    seen = tensors(observations)
+    entries = tensors(observations)
     for picture in (part for part in network.modules() if isinstance(part, Picture)):
         trunk = picture.trunk
         parts = trunk.parts if isinstance(trunk, Entries) else [trunk]
-        for part, entry in zip(parts, seen, strict=True):
+        for part, entry in zip(parts, entries, strict=True):
             if not isinstance(part, Trunk):
                 part.fit(entry)
 
@@ -237,8 +236,8 @@ class Picture(nn.Module):
         nn.init.uniform_(self.layer.weight, -self.bound, self.bound)
         nn.init.uniform_(self.layer.bias, -self.bound, self.bound)
 
-    def forward(self, *seen: Tensor) -> Tensor:
-        return self.layer(self.trunk(*seen)).float()
+    def forward(self, *entries: Tensor) -> Tensor:
+        return self.layer(self.trunk(*entries)).float()
 
 
 class Head(nn.Module):
@@ -275,14 +274,14 @@ class Actor(nn.Module):
         self.picture = Picture(frames, space=space)
         self.head = Head(action_size)
 
-    def forward(self, *seen: Tensor) -> Tensor:
-        return torch.tanh(self.head(self.picture(*seen)))
+    def forward(self, *entries: Tensor) -> Tensor:
+        return torch.tanh(self.head(self.picture(*entries)))
 
     @torch.no_grad()
     def act(self, observations: NDArray[Any]) -> NDArray[np.float32]:
         """Return actions float32 [batch, n] in [-1, 1] for observations [batch, ...]."""
-        seen = tensors(observations, self.head.output.weight.device)
-        return self(*seen).cpu().numpy()
+        entries = tensors(observations, self.head.output.weight.device)
+        return self(*entries).cpu().numpy()
 
 
 class Critic(nn.Module):
@@ -315,7 +314,7 @@ class Critic(nn.Module):
 
 
 class CriticPair(nn.Module):
-    """The two critics of TD3, whose smaller value counts; with the arguments of ``Critic``."""
+    """The two critics of TD3; targets use the smaller value. Takes the arguments of ``Critic``."""
 
     def __init__(self, *arguments: Any, **named: Any) -> None:
         super().__init__()
