@@ -232,7 +232,7 @@ def digest(values: Mapping[str, Any]) -> str:
 
 
 EXPERIMENTS: Mapping[str, Experiment] = msgspec.convert(DATA["experiments"], dict[str, Experiment])
-"""The paper's: name on the command line -> what it is."""
+"""The paper's experiments, by their names on the command line."""
 STUDIES: Mapping[str, Study] = {
     name: replace(study, name=name)
     for name, study in msgspec.convert(DATA["studies"], dict[str, Study]).items()

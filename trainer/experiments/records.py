@@ -28,7 +28,7 @@ from trainer.training.metrics import LEARNED as LEVELS
 from trainer.training.metrics import is_reached
 
 KEY = ["scenario", "algorithm", "setting", "seed"]  # A unit, in every table
-RECORD_FILE = "record.json"  # What a unit leaves in its directory: table -> column -> values
+RECORD_FILE = "record.json"  # A unit's file in its directory: table -> column -> values
 WRITING_PATIENCE_S = 60.0
 """Longest wait for another process to finish writing the tables."""
 SUCCESS, DISTANCE, REWARD = "success", "distance_m", "reward"
@@ -52,7 +52,7 @@ TRAINING, ALONE = "in training", "alone"
 on validation seeds."""
 SPENT = ["steps", "episodes", "human_steps", "human_s", "takeovers", "failures"]
 """Costs of a training or its beginning; failures are episodes that missed the goal."""
-END_STEPS = 1_500  # Episodes of a training's last so many steps are its end
+END_STEPS = 1_500  # Last steps of a training that count as its end
 LEARNED, WELL = LEVELS
 """Success of the policy alone at which it counts as learned, and as learned well."""
 Numbers = NDArray[np.float64]

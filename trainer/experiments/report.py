@@ -255,17 +255,17 @@ def default(records: Records) -> str | int:
 
     While pairs are missing, return instead the number of pairs of the row with the fewest.
     """
-    found = {row: pairs(records, row) for row in plan.RIVALS}
-    if (fewest := min(map(len, found.values()))) < PAIRS:
+    pairs_of = {row: pairs(records, row) for row in plan.RIVALS}
+    if (fewest := min(map(len, pairs_of.values()))) < PAIRS:
         return fewest
 
     def takes_its_place(row: str) -> bool:
         behind = (over(records, records.of(scenario, Line(row, plan.GOOD)), Line(PHIL, plan.GOOD),
                        f"success {condition}").high < 0.0
                   for scenario, condition in PAPER_SCENES)  # fmt: skip
-        return (found[row].own < found[row].phil).sum() >= ENOUGH and not any(behind)
+        return (pairs_of[row].own < pairs_of[row].phil).sum() >= ENOUGH and not any(behind)
 
-    better = {row: found[row].own.quantile(interpolation="higher")
+    better = {row: pairs_of[row].own.quantile(interpolation="higher")
               for row in filter(takes_its_place, plan.RIVALS)}  # fmt: skip
     return Line(min(better, key=better.__getitem__, default=PHIL)).name
 
@@ -283,13 +283,13 @@ def forgives(records: Records) -> tuple[list[str], list[str]]:
     """Return the rows that succeed with every human in the left turn, and those that do not."""
     good, less = list[str](), list[str]()
     for row in plan.HELPED:
-        found = {human: records.of("left_turn", Line(row, human)) for human in plan.HUMANS}
-        shares = {human: 100.0 * its["success nominal"].mean() for human, its in found.items()}
+        units = {human: records.of("left_turn", Line(row, human)) for human in plan.HUMANS}
+        shares = {human: 100.0 * rows["success nominal"].mean() for human, rows in units.items()}
         low = [f"{plan.words(human)} {share:.1f}" for human, share in shares.items()
                if share < 100.0 * data.LEARNED]  # fmt: skip
         if low:
             less.append(f"{Line(row).name} ({', '.join(low)})")
-        elif any(map(len, found.values())):
+        elif any(map(len, units.values())):
             good.append(Line(row).name)
     return good, less
 
@@ -368,12 +368,12 @@ def draw_points(name: str, quantities: list[tuple[str, str]], records: Records) 
     ):  # fmt: skip
         panel.set_title(f"{plan.words(scenario)}: {LOOKS['titles'][quantity]}", fontsize=10)
         for place, line in enumerate(lines):
-            found = records.of(scenario, line)
-            found = found.reindex(columns=[f"{quantity} {condition}" for condition in names])
+            units = records.of(scenario, line)
+            units = units.reindex(columns=[f"{quantity} {condition}" for condition in names])
             x = np.arange(len(names)) + 0.8 * (place + 0.5) / len(lines) - 0.4
             marker = LOOKS["markers"][line.setting]
             look = {"marker": marker, "ms": 5, "ls": "none", "capsize": 2, **_look(line, place)}
-            panel.errorbar(x, found.mean(), found.std(), **look)
+            panel.errorbar(x, units.mean(), units.std(), **look)
         panel.set_xticks(range(len(names)), names)
         panel.grid(alpha=0.3)
     figure.legend(*panel.get_legend_handles_labels(), ncols=6, loc="outside upper center")
@@ -394,14 +394,14 @@ def draw_guidance(records: Records) -> Figure:
         panel.plot([middle] * 2, [height - 0.35, height + 0.35], lw=2, color=colour)
 
     for (above, below), task in zip(panels.T, plan.TASKS, strict=True):
-        found = {row: records.of(task, Line(row, plan.GOOD)) for row in plan.ROWS}
+        units = {row: records.of(task, Line(row, plan.GOOD)) for row in plan.ROWS}
         costly = (*plan.HELPED, *plan.SHOWN)
-        learned = {row: found[row][f"human_s_to_{data.LEARNED:.0%}"] for row in costly}
+        learned = {row: units[row][f"human_s_to_{data.LEARNED:.0%}"] for row in costly}
         finite = [s for row in costly for s in learned[row] if s < np.inf]
         most = max(finite, default=1.0)
         never = 1.15 * most
         for row in plan.ROWS:
-            success = 100.0 * found[row]["success nominal"]
+            success = 100.0 * units[row]["success nominal"]
             dots(below, row, success, success.mean())
             if row in costly:
                 cut = learned[row].clip(upper=never)

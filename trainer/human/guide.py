@@ -75,7 +75,7 @@ class Guide:
     def watch(
         self, observation: Observation, policy_action: Action, doubt: float = 0.0
     ) -> Intervention | None:
-        """Return what the human does instead of ``policy_action``; None lets it pass. Once a step.
+        """Return the human's part in a step, or None to let ``policy_action`` pass. Once a step.
 
         ``doubt``: how much the critics differ about the action, for a robot that asks.
         """
@@ -86,7 +86,7 @@ class Guide:
         return outcome
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what a resumed run needs."""
+        """Return the state that a resumed run needs."""
         return {}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -211,7 +211,7 @@ class HumanGuide(Guide):
     def watch(
         self, observation: Observation, policy_action: Action, doubt: float = 0.0
     ) -> Intervention | None:
-        """Return what the human does instead of ``policy_action``, if anything."""
+        """Return the human's part in a step, or None to let ``policy_action`` pass."""
         reason, before = self.trigger.wants_control(policy_action), self._reason
         if self.asking:
             reason = self.asking.ask(doubt, reason)

@@ -26,7 +26,7 @@ marks the recorded episode, and nothing learns from it; ``quit`` ends the sittin
 ``failed`` are the person's word on an episode of which the environment says neither."""
 WISHES: tuple[Wish, ...] = get_args(Wish)
 Control = Literal["policy", "human", "returning"]
-"""What decides the applied action; ``returning``: the person has let go, and the action is on its
+"""Who decides the applied action; ``returning``: the person has let go, and the action is on its
 way back to the policy's, which still counts as the person's."""
 PERSON = "person"  # ``RunConfig.human`` of a run that a person guides
 HUMANS = ("web",)
@@ -48,13 +48,13 @@ def amount(action: Any) -> Amount:
     return values[0] if len(values) == 1 else tuple(values)
 
 
-def distance(one: Amount, other: Amount) -> float:
+def distance(first: Amount, second: Amount) -> float:
     """Return the largest difference between two actions."""
-    return float(np.abs(np.subtract(one, other)).max())
+    return float(np.abs(np.subtract(first, second)).max())
 
 
 def vector(action: Amount) -> Any:
-    """Convert an action to what the environment takes, float32 [n]."""
+    """Convert an action to the environment's form, float32 [n]."""
     return np.atleast_1d(np.asarray(action, np.float32))
 
 
@@ -82,7 +82,7 @@ class View:
     """``DrivingEnv.scene()``: plain lists and numbers in metres, y downwards, the ego car first; of
     another environment parts may lack. None: there is ``picture`` instead."""
     frames: NDArray[np.uint8] | None
-    """What the policy sees: [2, 45, 80], the older frame first; None: something else."""
+    """The policy's observation, [2, 45, 80], the older frame first; None if it is no such stack."""
     policy_action: Amount | None  # None where the person drives alone
     human_action: Amount  # The device's action, in control or not
     applied_action: Amount

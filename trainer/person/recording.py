@@ -39,7 +39,7 @@ class RecordedStep(msgspec.Struct, frozen=True):
     step: int  # In the episode, from 0
     time_ns: int  # When the device was read: wall time, ns since 1970
     time_s: float  # Simulated, since the episode's start
-    seen: bytes  # s: what the policy saw, as an .npy file
+    seen: bytes  # s: the policy's observation, as an .npy file
     seen_next: bytes  # s', likewise
     policy_action: Amount | None
     human_action: Amount  # The device's action

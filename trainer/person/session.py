@@ -1,6 +1,6 @@
 """A sitting: a person at the wheel beside a loop, which is paced, shown and recorded for them.
 
-`Sitting` is the loop's guide and its recorder, `PacedEnvironment` what the loop drives.
+`Sitting` is the loop's guide and recorder, `PacedEnvironment` the environment that it steps.
 """
 
 import argparse

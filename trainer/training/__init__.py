@@ -1,1 +1,1 @@
-"""The training loop: environment, human, learner, and what is kept of a run."""
+"""The training loop: environment, human, learner, and the files of a run."""

@@ -113,7 +113,7 @@ class LearningThread:
         )  # fmt: skip
 
     def begin(self, beta: float) -> None:
-        """Start an update, or several, on what is stored; ``beta`` is eq. 15's exponent."""
+        """Start one step's updates on the stored transitions; ``beta`` is eq. 15's exponent."""
         if not self._fitted:
             self.learner.fit_numbers(self.replay.observations(MOST_TO_FIT))
             self._scale_rewards()
@@ -259,7 +259,7 @@ class UnhurriedLearning(LearningThread):
         self._kept.append(transition)
 
     def begin(self, beta: float) -> None:
-        """Start an update on what is stored, unless the last one is still under way."""
+        """Start an update, unless the last one is still running."""
         if self._collect():
             super().begin(beta)
 

@@ -219,7 +219,7 @@ class TrainingRun:
             environments.check_foresight(self.env)
         network = parse_spec(config.latency)
         self.delayed = None if network == NO_NETWORK else DelayedVehicle(self.env, network)
-        self.vehicle: Any = self.delayed or self.env  # What the loop drives
+        self.vehicle: Any = self.delayed or self.env  # The environment that the loop steps
         self.learning = learning or LearningThread(config, self.env)
         self.guide = guide or make_guide(config, self.env)
         self.validation = validation or Validation(config, run_dir, self.learning, self.env)
