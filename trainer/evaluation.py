@@ -255,7 +255,7 @@ def load_driver(policy: str, env: Any, public_key: str | None = None) -> tuple[D
     if path.suffix == ".onnx":
         driver, wanted = OnnxDriver(path, public_key), task_of(env).text
         if (task := driver.policy.manifest.text) != wanted:
-            raise UserError(f"{policy} is for {task}, but {env.scenario} needs {wanted}")
+            raise UserError(f"{policy} is for {task}, but {env.scenario} asks for {wanted}")
         return driver, driver.policy.policy_id
     if (path / MODEL_FILE).is_file():
         return TogetherDriver(load_human_model(path, env)[0].eval().act), f"human:{path.name}"
