@@ -117,7 +117,7 @@ def compute_missing(arguments: argparse.Namespace, store: Store, wanted: Sequenc
             ends[end] += 1
             bar.advance({"last": str(job.unit)})
     counts = "".join(f", {count} {end}" for end, count in ends.items())
-    print(f"{len(done)} of {len(wanted)} units were done already{counts}")
+    print(f"{len(done)} of {len(wanted)} units were there already{counts}")
     if ends[FINISHED] < len(jobs):
         print("the same command goes on")
     return ends[FAILED]
