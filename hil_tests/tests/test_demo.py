@@ -53,6 +53,6 @@ def test_the_demo_makes_all_it_promises_and_then_uses_what_is_kept(tmp_path, mon
     for process in ("Process", "operator"):
         monkeypatch.setattr(demo, process, MagicMock())
     assert main(words) == first
-    assert "is kept" in capsys.readouterr().out
+    assert "Using the policy" in capsys.readouterr().out
     assert commands == [("trainer", "evaluate"), *[("bridge", "simulate")] * 3]
     assert (tmp_path / "demo" / "left_turn.onnx").read_bytes() == policy
