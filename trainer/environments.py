@@ -77,7 +77,7 @@ def make_environment(
         judge = load_named(success, "function") if success else None
         return Adapted(bridge.make_environment(name, scene), name, period_s, judge)
     if success:
-        raise UserError(f"success is not for {name}: the scenario reports it itself")
+        raise UserError(f"success is not for {name}, which itself says how an episode ended")
     scenario: Any = gymnasium.make(SCENARIOS[name], scene=scene).unwrapped
     if printed_reward:
         scenario.config = scenario.config.with_printed_reward()

@@ -73,7 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
     study = next((study for name, study in STUDIES.items() if name in names), plan.PAPER)
     alone = names - plan.EXPERIMENTS.keys()
     if alone and len(names) > 1 and names != {"status", study.name}:
-        raise UserError(f"{', '.join(sorted(alone))} cannot be combined with other names")
+        raise UserError(f"{', '.join(sorted(alone))}: no other name goes with it")
     store = _store(arguments, study)
     row, settings = arguments.algorithm, arguments.setting or plan.SETTINGS
     units = [unit for unit in store.study.units(seeds, arguments.scenario, names)

@@ -334,7 +334,7 @@ def test_experts_rows_and_keys_are_found_by_name(monkeypatch):
     assert controls.rest == pytest.approx((-0.5, -1.0))
     assert controls.keys == {"up": (1.5, 2.0), "a": pytest.approx((-0.5, 0.0))}
     for keys, says in (
-        ({"KeyQ": (0.0, 0.0)}, "is driven with q, which"),
+        ({"KeyQ": (0.0, 0.0)}, "uses the keys q, which"),
         ({}, "several actions, and no keys"),
     ):
         monkeypatch.setattr(Rover, "keys", keys)
