@@ -252,7 +252,7 @@ def test_what_a_simulator_does_to_directory_and_observations_is_found_out(
     assert {path.name for path in tmp_path.iterdir()} == {"run", "e.json", "p.onnx"}
     monkeypatch.chdir(tmp_path)
     bridge.say_once.cache_clear()
-    with pytest.raises(UserError, match=r"holds 0\.89.* to be uint8"):
+    with pytest.raises(UserError, match=r"holds 0\.89.* must be uint8"):
         make_environment(odd("FloatPicture")).reset(seed=0)
     for seed in (0, 1):
         make_environment(odd("Huge")).reset(seed=seed)
