@@ -39,6 +39,12 @@ def is_told(outcomes: Iterable[str]) -> bool:
     return not UNTOLD.issuperset(outcomes)
 
 
+def success_share(outcomes: Iterable[str]) -> float:
+    """Return the share of GOAL; nan if no outcome says whether its episode succeeded."""
+    outcomes = list(outcomes)
+    return outcomes.count(GOAL) / len(outcomes) if is_told(outcomes) else np.nan
+
+
 def settled(outcomes: Iterable[str]) -> list[str]:
     """Return the outcomes, with TIMEOUT for TRUNCATED if any episode reports how it ended."""
     outcomes = list(outcomes)

@@ -22,7 +22,7 @@ from typing import Any
 
 import pandas as pd
 
-from bridge.outcomes import GOAL, is_told, success_estimate
+from bridge.outcomes import success_estimate, success_share
 from bridge.report import ProgressBar
 from edge_runtime.cli import INTERRUPTED, quit_on_signals
 from edge_runtime.util import UserError, counted, name_in_file, read_json
@@ -231,8 +231,8 @@ def _train(config: RunConfig, run_dir: Path, env: Any, how: argparse.Namespace) 
             elif not math.isnan(metrics.validation_reward):
                 figures["validation"] = f"return {metrics.validation_reward:.1f}"
             figures["return"] = f"{fmean(m.episode_return for m in recent):.1f}"
-            if is_told(m.outcome for m in recent):
-                figures["success"] = f"{fmean(m.outcome == GOAL for m in recent):.2f}"
+            if not math.isnan(success := success_share(m.outcome for m in recent)):
+                figures["success"] = f"{success:.2f}"
             bar.advance(figures, metrics.steps if config.steps else 1)
 
         training.train(on_episode, end_s)

@@ -10,7 +10,7 @@ from typing import Any
 import pandas as pd
 from torch.utils.tensorboard import SummaryWriter
 
-from bridge.outcomes import GOAL, UNTOLD, failed, settled
+from bridge.outcomes import failed, settled, success_share
 from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError, read_bytes
 from trainer.util import fitting
@@ -105,8 +105,7 @@ class MetricsWriter:
         self._csv.writerow(row)
         self._file.flush()
         os.fsync(self._file.fileno())  # No power cut leaves a checkpoint without its rows.
-        if metrics.outcome not in UNTOLD:
-            row["success"] = float(metrics.outcome == GOAL)
+        row["success"] = success_share([metrics.outcome])
         for name, value in row.items():
             if isinstance(value, (int, float)) and value == value:
                 self._board.add_scalar(name, value, metrics.episode)

@@ -15,7 +15,7 @@ from msgspec import Meta
 
 from bridge.environments import finite
 from bridge.network import parse_spec
-from bridge.outcomes import DISCARDED, GOAL, is_told
+from bridge.outcomes import DISCARDED, GOAL, is_told, success_share
 from bridge.report import EpisodeResult
 from edge_runtime.files import write_json
 from trainer import environments, evaluation, util
@@ -137,13 +137,13 @@ class Validation(Trials):
         """Write an actor's results to ``metrics``, and keep the actor if it is the best."""
         count = self.config.evaluation_runs
         results, confirming = results[:count], results[count:]
-        validated = score(results)
-        metrics.validation_success, metrics.validation_reward = _told(validated, results)
+        validated = _, metrics.validation_reward = score(results)
+        metrics.validation_success = success_share(result.outcome for result in results)
         metrics.validation_distance_m = float(np.mean([result.distance_m for result in results]))
         confirmed = validated
         if confirming:
-            confirmed = score(confirming)
-            metrics.confirmed_success, metrics.confirmed_reward = _told(confirmed, confirming)
+            confirmed = _, metrics.confirmed_reward = score(confirming)
+            metrics.confirmed_success = success_share(result.outcome for result in confirming)
         elif self.config.confirmation_factor:
             return
         if validated >= self.best and confirmed >= self.confirmed:
@@ -163,12 +163,6 @@ class Validation(Trials):
         self._best_actor = state["best_actor"]
         if self._best_actor is not None:
             util.save_torch(self.run_dir / BEST_FILE, self._best_actor)
-
-
-def _told(scored: Score, results: Sequence[EpisodeResult]) -> Score:
-    """Return success and return; the success is nan if no episode reports any."""
-    success, mean_return = scored
-    return success if is_told(result.outcome for result in results) else math.nan, mean_return
 
 
 NOBODY = Guide()
