@@ -49,8 +49,7 @@ class LearningThread:
 
     The policy acts in that thread, too: another would bring a second pool of OpenMP threads, and
     the two would fight for the same cores. The networks are on the config's device. The replay and
-    the copy of the actor that acts are on the CPU, which answers a single observation sooner than a
-    GPU.
+    the actor that acts are on the CPU, which answers a single observation sooner than a GPU.
     """
 
     def __init__(self, config: RunConfig, env: Any) -> None:
@@ -76,7 +75,9 @@ class LearningThread:
         # nothing to a weight, but cost many times as long: 3 ms a step instead of 1. Flushed first
         # of all in this thread, so that the kernel's OpenMP threads inherit it.
         self._thread = ThreadPoolExecutor(1, "learner", torch.set_flush_denormal, (True,))
-        self._acting = copy.deepcopy(self.learner.actor).cpu()
+        self._acting = self.learner.actor
+        if self.learner.device.type != "cpu":
+            self._acting = copy.deepcopy(self._acting).cpu()
         self._begun: Future[tuple[list[Batch], list[Losses], float]] | None = None
         self._scenario = config.scenario
         self._fitted, self._renewed = False, 0
@@ -227,12 +228,11 @@ class LearningThread:
 
     def _refresh_actor(self) -> None:
         """Copy the learned weights to the actor that acts."""
-        self.in_thread(self._copy_actor)
+        if self._acting is not self.learner.actor:
+            self.in_thread(self._copy_actor)
 
     def _copy_actor(self) -> None:
-        copies, weights = (list(actor.state_dict().values()) for actor in
-                           (self._acting, self.learner.actor))  # fmt: skip
-        torch._foreach_copy_(copies, weights)
+        self._acting.load_state_dict(self.learner.actor.state_dict())
 
     def _forget_losses(self) -> None:
         self._losses: list[tuple[float, ...]] = []
@@ -248,6 +248,7 @@ class UnhurriedLearning(LearningThread):
 
     def __init__(self, config: RunConfig, env: Any) -> None:
         super().__init__(config, env)
+        self._acting = copy.deepcopy(self._acting)  # Updates must not change it while it acts.
         self._kept: list[Transition] = []
         # Lowers that thread's priority alone.
         self.in_thread(lambda: os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS))
