@@ -24,7 +24,7 @@ from edge_runtime.policy import load_policy
 from edge_runtime.reach import free_endpoint
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
-from hil_tests.processes import Process, operator
+from hil_tests.processes import Process, operator, wait_until
 from hil_tests.tests.shared.drives import TOY, make_policy, read, start_edge, start_simulate
 from hil_tests.tests.shared.messages import make_command
 from hil_tests.tests.shared.policies import STEERING, write_policy, write_rover
@@ -53,7 +53,8 @@ def test_an_interrupted_run_reports_the_episodes_that_it_drove(tmp_path):
     endpoint, out = free_endpoint(), tmp_path / "part.json"
     policy, many = make_policy(tmp_path, "constant"), ("--episodes", "9999")
     with start_edge(endpoint, policy) as edge, start_simulate(endpoint, out, TOY, *many) as run:
-        edge.wait_for_line("now=standby")
+        # The first standby comes before the simulator has counted its episode.
+        wait_until(lambda: edge.errors.count("now=standby") > 1, "two episodes", 60.0)
         run.send(signal.SIGTERM)
         assert run.wait(10) == 130
         time.sleep(0.5)
