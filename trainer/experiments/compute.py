@@ -35,7 +35,7 @@ from trainer.experiments.records import RECORD_FILE, Record, Store
 from trainer.human import MODEL_FILE
 from trainer.learner.kernel import load as load_kernel
 from trainer.learner.networks import bfloat16_is_faster
-from trainer.training.config import CONFIG_FILE, PRESETS, RunConfig
+from trainer.training.config import CONFIG_FILE, PRESETS, UNLIMITED_EPISODES, RunConfig
 from trainer.training.metrics import METRICS_FILE, read_metrics
 from trainer.training.run import TrainingRun
 from trainer.util import check_device, deadline_s
@@ -46,7 +46,6 @@ RENAMED = {"total_steps": "end_step", "episode_return": "return", "interventions
 """Column of a run's metrics -> column of the table of episodes."""
 TIMES = ["environment_s", "acting_s", "storing_s", "waiting_s"]
 """Columns of the metrics that add up to the time that a training took."""
-UNLIMITED_EPISODES = 10**6  # So many that the budget of steps ends a training
 TOGETHER = 50  # Test drives side by side
 NICENESS = 5  # Keeps the machine usable for others
 

@@ -13,7 +13,7 @@ from hil_tests.tests.shared.policies import public_pem
 from trainer.scenarios.left_turn import SCENES
 from trainer.tests.odd import odd
 from trainer.training.command import FINDS_NOTHING
-from trainer.training.config import RunConfig
+from trainer.training.config import UNLIMITED_EPISODES, RunConfig, make_config
 from trainer.training.metrics import read_metrics
 from trainer.util import save_torch
 
@@ -145,6 +145,14 @@ def config(tmp_path, capsys):
         return refusal(capsys, "train", "--out", str(tmp_path), "--resume", *given)
 
     return values, refused
+
+
+@pytest.mark.parametrize(
+    ("extent", "episodes"),
+    [({}, 400), ({"steps": 5, "episodes": None}, UNLIMITED_EPISODES), ({"steps": 5, "episodes": 7}, 7)],
+)
+def test_no_number_of_episodes_ends_a_training_of_so_many_steps(extent, episodes):
+    assert make_config("ours", extent).episodes == episodes
 
 
 GIVEN = "--seed 3 --episodes 4 --human web --set batch_size=8 --set evaluate_every_steps=7"

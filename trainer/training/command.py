@@ -134,7 +134,7 @@ def train(
     out: str | PathLike[str] | None = None,
     algorithm: str = DEFAULTS.algorithm,
     human: str = DEFAULTS.human,
-    episodes: int = DEFAULTS.episodes,
+    episodes: int | None = None,
     steps: int = DEFAULTS.steps,
     seed: int = DEFAULTS.seed,
     preset: str = "ours",

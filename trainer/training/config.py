@@ -22,6 +22,7 @@ RANGES = {
     (MIN_PERIOD_S, MAX_PERIOD_S): ("period_s",),
 }
 """Ranges of these numbers; all others are at least 0."""
+UNLIMITED_EPISODES = 10**6  # So many that the budget of steps ends a training
 CURVE_FILE = "learning_curve.png"
 EXTENT = ("episodes", "steps")  # Length of a run; a resumed run may raise it
 OPTIONS = (
@@ -48,7 +49,7 @@ class RunConfig:
     trainer/learner/config.py, one of an installed package, or ``MODULE:ROW``."""
     seed: int = 0
     episodes: int = 400
-    """Maximum number of training episodes (table A5: 400)."""
+    """Maximum number of training episodes (table A5: 400); no limit if only ``steps`` is given."""
     steps: int = 0
     """Stop after this many environment steps, at the end of the running episode; 0: no limit."""
     human: str = "expert"
@@ -157,6 +158,8 @@ def make_config(preset: str, values: Mapping[str, Any], env: Any = None) -> RunC
         raise UserError(f"preset must be one of {', '.join(PRESETS)}: {preset}")
     start, values = PRESETS[preset], dict(values)
     values["latency"] = str(parse_spec(values.get("latency", start.latency)))
+    if values.get("episodes") is None:
+        values["episodes"] = UNLIMITED_EPISODES if values.get("steps") else start.episodes
     algorithm = values.get("algorithm", start.algorithm)
     row, of_task = find_algorithm(algorithm), {}
     if env is not None and preset == "ours":

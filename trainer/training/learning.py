@@ -229,10 +229,7 @@ class LearningThread:
     def _refresh_actor(self) -> None:
         """Copy the learned weights to the actor that acts."""
         if self._acting is not self.learner.actor:
-            self.in_thread(self._copy_actor)
-
-    def _copy_actor(self) -> None:
-        self._acting.load_state_dict(self.learner.actor.state_dict())
+            self.in_thread(self._acting.load_state_dict, self.learner.actor.state_dict())
 
     def _forget_losses(self) -> None:
         self._losses: list[tuple[float, ...]] = []
@@ -283,7 +280,8 @@ class UnhurriedLearning(LearningThread):
         return super().state_dict()
 
     def _refresh_actor(self) -> None:
-        self._copy_actor()  # Here: the thread's low priority could make the loop wait.
+        # Here: the thread's low priority could make the loop wait.
+        self._acting.load_state_dict(self.learner.actor.state_dict())
 
     def settle(self) -> None:
         # Short waits: a signal that another thread received does not wake the main thread.
