@@ -177,7 +177,3 @@ def _switch(releases: Releases, service: Systemd, version: str) -> None:
         now = f"went back to {good}" if good else "nothing is installed"
         why = str(error) or "interrupted"
         raise UnhealthyError(f"release {version} was not healthy, {now}: {why}") from None
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
