@@ -7,6 +7,7 @@ parties that listen get a server's certificate: no viewer can pose as a simulato
 from __future__ import annotations
 
 import argparse
+import contextlib
 import datetime
 import ipaddress
 import os
@@ -156,12 +157,10 @@ def _pem(key: ec.EllipticCurvePrivateKey | ed25519.Ed25519PrivateKey) -> bytes:
 def read_authority(folder: Path) -> CertificatePair:
     pem = read_bytes(folder / tls.CA_FILE, "authority")
     key = tls.read_private_key(folder / CA_KEY_FILE)
-    try:
+    with contextlib.suppress(ValueError):
         certificate = x509.load_pem_x509_certificate(pem)
         if key.public_key() == certificate.public_key():
             return CertificatePair(certificate, key)
-    except ValueError:
-        pass
     raise UserError(f"{folder} holds no {tls.CA_FILE} with its {CA_KEY_FILE}")
 
 
