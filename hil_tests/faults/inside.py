@@ -110,17 +110,23 @@ if "PhilEndless-v0" not in gymnasium.registry:
     )
 
 
+def switched(name: str) -> str:
+    """Return the word in a switch, empty where there is no such file."""
+    switch = HERE / name
+    return switch.read_text() if switch.exists() else ""
+
+
 class FaultyMockVehicle(MockVehicle):
     """The mock, with the fault that VEHICLE holds; ``locked`` cannot be enabled."""
 
     def enable(self, now_s: float) -> None:
-        if self._fault() == "locked":
+        if switched(VEHICLE) == "locked":
             raise RuntimeError("no control of the gearbox")
         super().enable(now_s)
 
     def feedback(self, now_s: float) -> VehicleReport:
         report = super().feedback(now_s)
-        match self._fault():
+        match switched(VEHICLE):
             case "silent":
                 raise TimeoutError("the vehicle says nothing")
             case "self_braking":
@@ -133,10 +139,6 @@ class FaultyMockVehicle(MockVehicle):
                 return report._replace(speed_mps=report.speed_mps + _LEAP_MPS)
         return report
 
-    def _fault(self) -> str:
-        switch = HERE / VEHICLE
-        return switch.read_text() if switch.exists() else ""
-
 
 class FaultySource:
     speed_mps = 0.5
@@ -146,8 +148,7 @@ class FaultySource:
         self._random = np.random.default_rng()
 
     def observe(self) -> Observation:
-        switch = HERE / SOURCE
-        match switch.read_text() if switch.exists() else "":
+        match switched(SOURCE):
             case "raises":
                 raise OSError("the camera is gone")
             case "late":
@@ -162,11 +163,16 @@ def launch(package: str, *arguments: str) -> None:
 
     SIGUSR1 steps its wall clock one hour ahead, SIGUSR2 back. SLOW adds SLOWER_S to an inference.
     """
-    real, real_ns, act, step_s = time.time, time.time_ns, Policy.act, [0]
-    time.time = lambda: real() + step_s[0]
-    time.time_ns = lambda: real_ns() + step_s[0] * 10**9
-    for number, to_s in ((signal.SIGUSR1, _STEP_S), (signal.SIGUSR2, 0)):
-        signal.signal(number, lambda *_, to_s=to_s: step_s.__setitem__(0, to_s))
+    real, real_ns, act, ahead_s = time.time, time.time_ns, Policy.act, 0
+
+    def step_clock(number: int, _: Any) -> None:
+        nonlocal ahead_s
+        ahead_s = _STEP_S if number == signal.SIGUSR1 else 0
+
+    time.time = lambda: real() + ahead_s
+    time.time_ns = lambda: real_ns() + ahead_s * 10**9
+    for number in (signal.SIGUSR1, signal.SIGUSR2):
+        signal.signal(number, step_clock)
 
     def act_slowly(*arguments: Any) -> np.ndarray:
         time.sleep(SLOWER_S * (HERE / SLOW).exists())
