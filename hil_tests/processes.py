@@ -90,10 +90,9 @@ class Process:
     def has_ended(self) -> bool:
         return self._process.poll() is not None
 
-    def wait_for_line(self, text: str, timeout_s: float = PATIENCE_S) -> float:
+    def wait_for_line(self, text: str) -> float:
         """Wait for the first line with ``text``; return when it came, monotonic s."""
-        what = f"{text!r} from pid {self.pid}"
-        return float(wait_until(lambda: self._when(text), what, timeout_s))
+        return float(wait_until(lambda: self._when(text), f"{text!r} from pid {self.pid}"))
 
     def tell(self, line: str) -> None:
         assert self._process.stdin is not None

@@ -14,6 +14,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from functools import partial
+from itertools import takewhile
 from typing import NamedTuple
 
 from edge_runtime.safety import Event
@@ -88,12 +89,9 @@ def at_fault(expect: Expect, rig: Rig) -> Try:
 
 def _zero_s(monitor: CanMonitor, on_s: float, until_s: float) -> float:
     """Return since when every set-point has been speed 0; ``until_s`` if none has."""
-    zero_s = until_s
-    for seen_s, data in reversed(monitor.of(SET_POINT, on_s)):
-        if speed_mps(data) != 0.0:
-            break
-        zero_s = min(zero_s, seen_s)
-    return zero_s
+    newest_first = reversed(monitor.of(SET_POINT, on_s))
+    zeros = takewhile(lambda sent: speed_mps(sent[1]) == 0.0, newest_first)
+    return min([until_s, *(seen_s for seen_s, _ in zeros)])
 
 
 def strange_frames(monitor: CanMonitor) -> list[str]:

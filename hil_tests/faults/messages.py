@@ -145,10 +145,8 @@ def garbage_health(rig: Rig) -> Try:
 
 def _put_garbage(rig: Rig, topic: str, valid: Message) -> Try:
     """Send COUNT mutations of a message; those still valid belong to a foreign session."""
-    decode = DECODERS[topic]
+    decode = Layout(rig.task).decode if topic == "state" else DECODERS[topic]
     legal = "foreign_session" if topic in ("state", "command") else ""
-    if topic == "state":
-        decode = Layout(rig.task).decode
     sent: Counter[str] = Counter()
     begin_s = time.monotonic()
     for number, payload in enumerate(mutated(encode(valid), COUNT, rig.number)):

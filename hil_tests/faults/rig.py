@@ -197,14 +197,12 @@ class Rig:
     def logged_stop(self, since_s: float) -> tuple[float, str]:
         """Wait for the edge runtime's safe stop after ``since_s``; return its time and reason."""
 
-        def stop() -> tuple[float, str] | None:
-            for seen_s, line in self.edge.lines:
-                if seen_s > since_s and (match := _STOPPED.search(line)):
-                    return seen_s, match[1] or ""
-            return None
+        def stops() -> list[tuple[float, str]]:
+            matches = ((s, _STOPPED.search(line)) for s, line in self.edge.lines if s > since_s)
+            return [(s, match[1] or "") for s, match in matches if match]
 
-        logged: tuple[float, str] = wait_until(stop, "safe_stop in the log")
-        return logged
+        first: tuple[float, str] = wait_until(stops, "safe_stop in the log")[0]
+        return first
 
     def last_drive_s(self) -> float:
         times = (c.seen_s for c in reversed(self.timeline.commands) if c.mode == DRIVE)

@@ -52,11 +52,9 @@ def run_faults(
     manifest = load_policy(policy, public_key, allow_unsigned=True).manifest
     ended = threading.Event()  # No more tries begin
     with tempfile.TemporaryDirectory(prefix="phil-faults-") as folder:
-        policies = {"given": ["--policy", str(policy), "--allow-unsigned"]}
+        paths = {"given": policy, **{kind: write_policy(Path(folder), kind) for kind in POLICIES}}
+        policies = {kind: ["--policy", str(paths[kind]), "--allow-unsigned"] for kind in paths}
         policies["given"] += ["--public-key", public_key] if public_key else []
-        for kind in POLICIES:
-            path = write_policy(Path(folder), kind)
-            policies[kind] = ["--policy", str(path), "--allow-unsigned"]
 
         def do(row: Row) -> dict[str, Any]:
             task, outcome = manifest if row.policy == "given" else TASK, Outcome()
