@@ -58,14 +58,18 @@ def run_faults(
 
         def do(row: Row) -> dict[str, Any]:
             task, outcome = manifest if row.policy == "given" else TASK, Outcome()
-            while len(outcome.tries) < tries and not ended.is_set():
+
+            def is_left() -> bool:
+                return len(outcome.tries) < tries and not ended.is_set()
+
+            while is_left():
                 place = Path(tempfile.mkdtemp(dir=folder))
                 try:
                     rig = Rig(policies[row.policy], place, task, **row.rig)
                 except (OSError, UserError) as error:  # for example without multicast
                     outcome.tries.append(Try(wrong=[str(error)]))
                     break
-                use_rig(row, rig, outcome, tries, on_try, ended)
+                use_rig(row, rig, outcome, is_left, on_try)
             return report_row(row, outcome, later_s(task))
 
         by_name: dict[str, dict[str, Any]] = {}
@@ -88,17 +92,12 @@ def run_faults(
 
 
 def use_rig(
-    row: Row,
-    rig: Rig,
-    outcome: Outcome,
-    tries: int,
-    on_try: Callable[[str], None],
-    ended: threading.Event,
+    row: Row, rig: Rig, outcome: Outcome, is_left: Callable[[], bool], on_try: Callable[[str], None]
 ) -> None:
-    """Do tries of a row with a rig until all are done, or the rig hangs or is used up."""
+    """Do tries of a row with a rig while one is left, until the rig hangs or is used up."""
     with rig:
         usable = True
-        while usable and len(outcome.tries) < tries and not ended.is_set():
+        while usable and is_left():
             rig.number, begin_s = len(outcome.tries), time.monotonic()
             try:
                 rig.wait_until_driving()

@@ -1,6 +1,5 @@
 """Two real faults (all: `hil_tests campaign --only faults`), and what the verdicts rest on."""
 
-import threading
 from pathlib import Path
 from unittest.mock import MagicMock
 
@@ -67,7 +66,7 @@ def test_safe_stops_at_the_pace_of_drives_are_no_drive():
 def test_a_rig_that_fails_is_a_failed_try_and_ends_no_campaign(monkeypatch):
     rig, outcome = MagicMock(crashes=["edge"], timeline=DriveTimeline(), task=TASK), Outcome()
     rig.wait_until_driving.side_effect = BrokenPipeError("the chassis is gone")
-    use_rig(ROW, rig, outcome, 2, lambda name: None, threading.Event())
+    use_rig(ROW, rig, outcome, lambda: True, lambda name: None)
     assert [each.wrong for each in outcome.tries] == [["try 0: the chassis is gone"]]
     assert outcome.crashes == ["edge"]
 
