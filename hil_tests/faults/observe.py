@@ -26,7 +26,7 @@ from edge_runtime.transport import open_session
 from edge_runtime.vehicles.hunter import open_bus, parse_bus
 from edge_runtime.vehicles.hunter.protocol import FRAMES
 from edge_runtime.wire import DRIVE, SAFE_STOP
-from hil_tests.faults.policies import TASK
+from hil_tests.faults.policies import TASK, VEHICLE_ID
 
 REACTION_LIMIT_S = 2 * TASK.control_period_s + 0.05
 """From the last good state to a safe stop on the wire, or to the other end's own brake."""
@@ -120,18 +120,13 @@ class Probe:
     """
 
     def __init__(
-        self,
-        listen: str,
-        connect: str | None,
-        vehicle_id: str,
-        timeline: DriveTimeline,
-        stack: contextlib.ExitStack,
+        self, listen: str, connect: str | None, timeline: DriveTimeline, stack: contextlib.ExitStack
     ) -> None:
-        self._timeline, self._vehicle_id = timeline, vehicle_id
+        self._timeline = timeline
         opened = open_session(listen=listen, connect=connect, mode="router")
         self._session = stack.enter_context(opened)
         for topic in ("state", "command", "health", "feedback"):
-            key, hear = wire.key(vehicle_id, topic), partial(self._hear, topic)
+            key, hear = wire.key(VEHICLE_ID, topic), partial(self._hear, topic)
             # Not its own messages.
             hears: Any = {"handler": hear, "allowed_origin": zenoh.Locality.REMOTE}
             stack.enter_context(self._session.declare_subscriber(key, **hears))
@@ -139,7 +134,7 @@ class Probe:
     def put(self, topic: str, payload: bytes) -> None:
         # BLOCK, so that no message that the campaign counts as sent is dropped.
         block = zenoh.CongestionControl.BLOCK
-        self._session.put(wire.key(self._vehicle_id, topic), payload, congestion_control=block)
+        self._session.put(wire.key(VEHICLE_ID, topic), payload, congestion_control=block)
 
     def _hear(self, topic: str, sample: zenoh.Sample) -> None:
         seen_s, offset_ns = time.monotonic(), time.time_ns() - time.monotonic_ns()

@@ -1,4 +1,4 @@
-"""The task of the fault rows, and one-line policies for it."""
+"""The vehicle and the task of the fault rows, and one-line policies for it."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import onnx.parser
 from bridge.policy_file import make_policy
 from edge_runtime.manifest import Action, Car, Entry, Task
 
+VEHICLE_ID = "faults"
 TASK = Task(
     task="left_turn", observation={"frames": Entry(dtype="uint8", shape=[2, 45, 80])},
     action=[Action(name="pedal", low=-1.0, high=1.0, stop=-1.0)], control_period_s=0.1,

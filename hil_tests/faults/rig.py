@@ -29,9 +29,9 @@ from edge_runtime.vehicles.hunter import MULTICAST_GROUP
 from edge_runtime.wire import DRIVE, SAFE_STOP, State, encode
 from hil_tests.faults import inside
 from hil_tests.faults.observe import CanMonitor, CommandSeen, DriveTimeline, Probe, Relay
+from hil_tests.faults.policies import VEHICLE_ID
 from hil_tests.processes import Process, wait_until
 
-VEHICLE_ID = "faults"
 _INSIDE = "hil_tests.faults.inside"
 _STOPPED = re.compile(r"\bmode\b.*\bnow\W+safe_stop\b(?:.*\breason\W+(\w+))?")
 _TOLD = re.compile(r"chassis t=([\d.]+) .*motion=(\w+)")
@@ -86,7 +86,7 @@ class Rig:
             if not sender:
                 self.simulator = self.start_simulator()
             connect = None if sender else self._listen
-            self.probe = Probe(self._hub, connect, VEHICLE_ID, self.timeline, self._closing)
+            self.probe = Probe(self._hub, connect, self.timeline, self._closing)
             if between == "relay":
                 self.relay = Relay(self._hub)
                 self._closing.callback(self.relay.close)

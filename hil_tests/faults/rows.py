@@ -26,7 +26,8 @@ from bridge.recording import Recording, heard_of
 from edge_runtime.wire import DRIVE, SAFE_STOP, State, decode_state, encode
 from hil_tests.faults.inside import MOCK, SLOW, SOURCE, VEHICLE
 from hil_tests.faults.observe import REACTION_LIMIT_S, RECOVERY_LIMIT_S
-from hil_tests.faults.rig import VEHICLE_ID, Rig, noisy_state
+from hil_tests.faults.policies import VEHICLE_ID
+from hil_tests.faults.rig import Rig, noisy_state
 from hil_tests.processes import wait_until
 from trainer.util import cores
 
