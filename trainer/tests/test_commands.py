@@ -149,7 +149,11 @@ def config(tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ("extent", "episodes"),
-    [({}, 400), ({"steps": 5, "episodes": None}, UNLIMITED_EPISODES), ({"steps": 5, "episodes": 7}, 7)],
+    [
+        ({}, 400),
+        ({"steps": 5, "episodes": None}, UNLIMITED_EPISODES),
+        ({"steps": 5, "episodes": 7}, 7),
+    ],
 )
 def test_no_number_of_episodes_ends_a_training_of_so_many_steps(extent, episodes):
     assert make_config("ours", extent).episodes == episodes
