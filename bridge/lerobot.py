@@ -163,7 +163,7 @@ def _encode(
     sampled = []
     with film(path, rate, ENCODER) as add:
         for array in arrays:
-            images: Any = images_of(array)
+            images = images_of(array)
             height, width = images.shape[1:3]
             picture = np.ascontiguousarray(np.broadcast_to(images[-1], (height, width, 3)))
             add(picture)

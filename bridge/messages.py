@@ -156,17 +156,15 @@ def read_scene(scene: Mapping[str, Any]) -> SeenScene:
     return seen
 
 
-def is_picture(entry: Entry) -> bool:
-    return entry.dtype == "uint8" and len(entry.shape) > 1
+def is_picture(values: Entry | np.ndarray) -> bool:
+    return values.dtype == "uint8" and len(values.shape) > 1
 
 
-def images_of(array: np.ndarray) -> np.ndarray | None:
-    """Return bytes in two dimensions or more as images [count, height, width, 1 or 3], or None."""
-    if array.dtype != np.uint8 or array.ndim < 2:
-        return None
-    colours = 3 if array.ndim > 2 and array.shape[-1] == 3 else 1
-    last = (*array.shape[-3:-1], 3) if colours == 3 else (*array.shape[-2:], 1)
-    return array.reshape(-1, *last)
+def images_of(picture: np.ndarray) -> np.ndarray:
+    """Return what `is_picture` as images [count, height, width, 1 or 3]."""
+    in_colours = picture.ndim > 2 and picture.shape[-1] == 3
+    shape = picture.shape[-3:] if in_colours else (*picture.shape[-2:], 1)
+    return picture.reshape(-1, *shape)
 
 
 def decode_scene(payload: bytes) -> Scene | wire.Rejection:

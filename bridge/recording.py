@@ -26,7 +26,7 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from bridge import messages
 from bridge import rerun as view
-from bridge.messages import DECODERS, SHADOW, TOKEN_TOPICS, Heard, Scene, decode, images_of
+from bridge.messages import DECODERS, SHADOW, TOKEN_TOPICS, Heard, Scene, decode
 from edge_runtime import __version__, wire
 from edge_runtime.files import check_writable, make_directory
 from edge_runtime.manifest import Layout
@@ -346,9 +346,10 @@ class ViewerCopies:
         if layout.refusal(state.observation) is not None:
             return
         for name, array in layout.arrays(state.observation).items():
-            if (images := images_of(array)) is None:
+            if not messages.is_picture(array):
                 continue
             # Consecutive images are, in memory, one picture with `count` times the height.
+            images = messages.images_of(array)
             count, height, width, colours = images.shape
             encoding = "rgb8" if colours == 3 else "mono8"
             size = (width, count * height, encoding, width * colours)

@@ -84,10 +84,11 @@ class Canvas:
     def observation(self, entries: Mapping[str, np.ndarray]) -> None:
         """Draw an observation: its pictures (the newest is the last), and its first numbers."""
         for name, array in entries.items():
-            if (images := messages.images_of(array)) is None:
+            if not messages.is_picture(array):
                 self.scalar(f"observation/{name}", *array.ravel()[:MOST_LINES])
                 continue
-            for place, image in zip(("now", "before"), images[::-1], strict=False):
+            newest_first = messages.images_of(array)[::-1]
+            for place, image in zip(("now", "before"), newest_first, strict=False):
                 model = rr.ColorModel.L if image.shape[-1] == 1 else rr.ColorModel.RGB
                 self.log(f"frames/{place}", rr.Image(image, color_model=model))
 
