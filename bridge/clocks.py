@@ -23,7 +23,7 @@ import msgspec
 
 from bridge import inbound, network
 from bridge.inbound import Decision
-from edge_runtime.manifest import Layout, Task
+from edge_runtime.manifest import Layout
 from edge_runtime.safety import Event
 from edge_runtime.util import UserError
 from edge_runtime.wire import SAFE_STOP, Command, Feedback, Reason, State, encode
@@ -44,7 +44,6 @@ class _Clock:
     publish: Publish
     check: inbound.CommandCheck
     spec: network.LatencySpec
-    task: Task
     latencies_ms: list[float] = field(default_factory=list)
     """From state sent to command received, injected delays included; one per answered state."""
     missed_ticks: int = 0
@@ -54,6 +53,7 @@ class _Clock:
     a stop for lateness: it was gone or starved. Always 0 in real time."""
 
     def __post_init__(self) -> None:
+        self.task = self.check.task
         self._period_s = self.task.control_period_s
         self._silence_s = inbound.BRAKE_PERIODS * self._period_s
         self._hold = inbound.CommandHold(0.0, self._period_s)
@@ -260,10 +260,6 @@ class VehicleClock(RealTimeClock):
 
     def wait_for_standstill(self) -> None:
         self._wait_until(lambda it: abs(it.speed_mps) < STANDSTILL_MPS, STANDSTILL_WAIT_S)
-
-    def rejected(self) -> Counter[str]:
-        feedback = dict(self.feedback_check.rejected).items()
-        return super().rejected() + Counter({f"feedback_{name}": n for name, n in feedback})
 
     def exchange(self, state: State) -> Decision:
         """Wait for the tick, send its state, and return the vehicle's decision at the next tick."""

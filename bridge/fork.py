@@ -169,7 +169,7 @@ class ForkedDrive(LockStepClock):
         self._newest, self._now_ns = -1, drive.began_ns
         task = msgspec.structs.replace(drive.task, action=policy.manifest.action)
         network = network or parse_spec(drive.origin.latency)
-        super().__init__(self._answer, CommandCheck("fork", task), network, task)
+        super().__init__(self._answer, CommandCheck("fork", task), network)
 
     def run(self) -> EpisodeResult:
         """Drive to the end; UserError where the drive cannot be rebuilt until the fork."""

@@ -90,10 +90,9 @@ class CommandCheck:
     """
 
     def __init__(self, session: str, task: Task) -> None:
-        self.session = session
+        self.session, self.task = session, task
         self.rejected: Counter[str] = Counter()
         self.policy_ids: list[str] = []
-        self.actions, self.period_s = task.action, task.control_period_s
         self.newest = (0, -1)  # Episode and step of the newest state that was sent
         self._is_over = False
         self._stamps: deque[int] = deque(maxlen=64)  # Of recent commands: a copy counts once
@@ -130,9 +129,9 @@ class CommandCheck:
             return None
         if command.policy_id not in self.policy_ids:
             self.policy_ids.append(command.policy_id)
-        if command.mode == SAFE_STOP and _action_fault(command.action, self.actions):
+        if command.mode == SAFE_STOP and _action_fault(command.action, self.task.action):
             # The mode alone makes it a stop; its action is replaced by a valid one.
-            stop = [row.stop or min(max(0.0, row.low), row.high) for row in self.actions]
+            stop = [row.stop or min(max(0.0, row.low), row.high) for row in self.task.action]
             return msgspec.structs.replace(command, action=stop)
         return command
 
@@ -144,9 +143,9 @@ class CommandCheck:
             return Reason.FOREIGN_SESSION.value
         plan = command.plan or []
         for action in (command.action, *plan) if command.mode == DRIVE else ():
-            if fault := _action_fault(action, self.actions):
+            if fault := _action_fault(action, self.task.action):
                 return fault
-        if len(plan) * self.period_s > wire.MAX_RIDE_S + ROUNDING_S:
+        if len(plan) * self.task.control_period_s > wire.MAX_RIDE_S + ROUNDING_S:
             return "plan_too_long"  # It lasts longer than MAX_RIDE_S
         if (command.episode, command.step) > self.newest:
             return UNKNOWN_STEP
@@ -166,18 +165,17 @@ def _action_fault(
 
 
 class FeedbackCheck:
-    """Reads feedback for the session of ``commands``; counts over the whole run.
+    """Reads feedback for the session of ``commands``, and counts what it rejects there.
 
     Feedback of another session is no fault until the vehicle has taken a command of this one. Older
     stamps are stale; after 2 T of silence any stamp is accepted, because the board may be another.
     """
 
     def __init__(self, commands: CommandCheck) -> None:
-        self.rejected: Counter[str] = Counter()
         self.heard: Feedback | None = None
         """The last readable feedback, of any session: it shows that a vehicle is there."""
         self.heard_s = 0.0
-        self._commands, self._silence_s = commands, BRAKE_PERIODS * commands.period_s
+        self.commands, self._silence_s = commands, BRAKE_PERIODS * commands.task.control_period_s
         self._met = False  # The vehicle has taken a command of this session.
         self._newest: Feedback | None = None
         self._newest_s = 0.0
@@ -186,15 +184,15 @@ class FeedbackCheck:
         """Return the feedback if it is this vehicle's newest, else None; ``now_s`` is monotonic."""
         feedback = wire.decode_feedback(payload)
         if isinstance(feedback, Rejection):
-            self.rejected[feedback.reason.value] += 1
+            self.commands.reject(f"feedback_{feedback.reason.value}")
             return None
         self.heard, self.heard_s = feedback, now_s
-        own = feedback.session in (self._commands.session, NOT_COMMANDED)
+        own = feedback.session in (self.commands.session, NOT_COMMANDED)
         if fault := self._fault(feedback, now_s) if own else Reason.FOREIGN_SESSION.value:
             if own or self._met:
-                self.rejected[fault] += 1
+                self.commands.reject(f"feedback_{fault}")
             return None
-        self._met = self._met or feedback.session == self._commands.session
+        self._met = self._met or feedback.session == self.commands.session
         self._newest, self._newest_s = feedback, now_s
         return feedback
 
@@ -220,9 +218,10 @@ class FeedbackCheck:
         return replace(by_commands, brake_reason=reason, ridden=ridden, feedback=feedback)
 
     def _fault(self, feedback: Feedback, now_s: float) -> str:
-        if fault := _action_fault(feedback.action, self._commands.actions, FEEDBACK_ROUNDING):
+        actions = self.commands.task.action
+        if fault := _action_fault(feedback.action, actions, FEEDBACK_ROUNDING):
             return fault
-        if (feedback.episode, feedback.step) > self._commands.newest:
+        if (feedback.episode, feedback.step) > self.commands.newest:
             return UNKNOWN_STEP
         newest_ns = -1 if self._newest is None else self._newest.sent_ns
         if feedback.sent_ns == newest_ns:

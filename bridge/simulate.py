@@ -77,7 +77,7 @@ def run(asked: Namespace) -> int:
         port = stack.enter_context(opened)
         kind = VehicleClock if asked.loop == VEHICLE else CLOCKS[asked.clock]
         check = CommandCheck(port.session, task)
-        clock = stack.enter_context(closing(kind(port.publish_state, check, asked.latency, task)))
+        clock = stack.enter_context(closing(kind(port.publish_state, check, asked.latency)))
         port.hear("command", clock.receive)
         here = (endpoint, asked.vehicle_id, tls)
         edge = port.wait_for_edge(wait_s, start := run_command(*here))

@@ -58,7 +58,7 @@ class Rig:
 
     def __init__(self, spec="none", answer=obedient, kind=LockStepClock):
         self.check: Any = CommandCheck("here", TASK)
-        self.clock = kind(self.publish, self.check, parse_spec(spec), TASK)
+        self.clock = kind(self.publish, self.check, parse_spec(spec))
         self.published: list[int] = []
         self.answer = answer
 
@@ -238,7 +238,7 @@ class VehicleRig(Rig):
     """A clock with a vehicle that reports the step it was sent last, 30 ms after each."""
 
     def __init__(self, spec="none"):
-        self.clock = VehicleClock(self.publish, CommandCheck("here", TASK), parse_spec(spec), TASK)
+        self.clock = VehicleClock(self.publish, CommandCheck("here", TASK), parse_spec(spec))
         self.check = self.clock.feedback_check
         self.close = self.clock.close
 

@@ -165,14 +165,14 @@ def test_feedback_that_cannot_be_believed_is_counted_by_reason(changes, reason):
     check, believed = checking_feedback(), make_feedback(4)
     assert check.read(encode(believed), now_s=0.0) == believed
     assert check.read(bad, now_s=0.05) is None
-    assert dict(check.rejected) == {reason: 1}
+    assert dict(check.commands.rejected) == {f"feedback_{reason}": 1}
 
 
 def test_a_vehicle_that_answers_the_last_simulator_is_there_but_not_believed():
     check = checking_feedback()
     before = make_feedback(900, session="the one before")
     assert check.read(encode(before), now_s=0.0) is None
-    assert (check.heard, dict(check.rejected)) == (before, {})
+    assert (check.heard, dict(check.commands.rejected)) == (before, {})
     uncommanded = make_feedback(-1, session="", episode=-1)
     assert check.read(encode(uncommanded), now_s=0.1) == uncommanded
 
@@ -183,7 +183,7 @@ def test_after_silence_another_board_with_a_slow_clock_is_believed():
     early = encode(make_feedback(-1, session="", episode=-1, sent_ns=7))
     assert check.read(early, now_s=0.15) is None
     assert check.read(early, now_s=0.25) is not None
-    assert dict(check.rejected) == {"stale": 1}
+    assert dict(check.commands.rejected) == {"feedback_stale": 1}
 
 
 MANIFEST: Any = None  # Nobody looks at it.
