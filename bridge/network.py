@@ -7,13 +7,14 @@ reordering, duplication and, if order is kept, waits for those before it.
 
 from __future__ import annotations
 
-import heapq
+import bisect
 import itertools
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from functools import partial
+from operator import itemgetter
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import msgspec
@@ -315,9 +316,8 @@ class VirtualLink(Generic[Message]):
         self._link = make_network(spec, seed)
         self.latencies_ms: list[float] = []
         self.stale = 0
-        # A heap by arrival time; messages of the same time keep their order.
-        self._under_way: list[tuple[float, int, Callable[[float], Arrival[Message] | None]]] = []
-        self._numbers = itertools.count()
+        # By arrival time; messages of the same time keep their order.
+        self._under_way: list[tuple[float, Callable[[float], Arrival[Message] | None]]] = []
         self._newest_at_edge = -1
         self._safety = safety.Safety(period_s)
         self._freshness = Freshness(self._safety.answer_s)
@@ -334,7 +334,7 @@ class VirtualLink(Generic[Message]):
     def next_at_edge(self) -> Arrival[Message] | None:
         """Let time run to the next state's arrival at the edge runtime; None at window end."""
         while self._under_way and self._under_way[0][0] <= self._window_end_s + ROUNDING_S:
-            now_s, _, arrive = heapq.heappop(self._under_way)
+            now_s, arrive = self._under_way.pop(0)
             if arrival := arrive(now_s):
                 return arrival
         return None
@@ -361,7 +361,7 @@ class VirtualLink(Generic[Message]):
         return self.hold.decide(self._admitted_s if answered else self._window_end_s, edge_silent)
 
     def _push(self, arrival_s: float, arrive: Callable[[float], Arrival[Message] | None]) -> None:
-        heapq.heappush(self._under_way, (arrival_s, next(self._numbers), arrive))
+        bisect.insort(self._under_way, (arrival_s, arrive), key=itemgetter(0))
 
     def _arrive_at_edge(self, step: int, message: Message, now_s: float) -> Arrival[Message]:
         overtaken = step <= self._newest_at_edge
