@@ -270,11 +270,9 @@ class Adapter:
         """Zero, or the nearest in range: the action before the first command."""
         self.last = self.hands_off
 
-    def arrays(self, observation: Any) -> dict[str, np.ndarray]:
-        return arrays_of(self.task, observation)
-
     def pack(self, observation: Any) -> dict[str, bytes]:
-        return {name: array.tobytes() for name, array in self.arrays(observation).items()}
+        arrays = arrays_of(self.task, observation)
+        return {name: array.tobytes() for name, array in arrays.items()}
 
     def within(self, action: Any) -> np.ndarray:
         values = np.asarray(action, self._space.dtype).reshape(self._space.shape)

@@ -251,7 +251,7 @@ class Adapted(bridge.Adapter):
     def _as_array(self, observation: Any) -> NDArray[Any]:
         """Pack an observation into one array; UserError for a number that is not finite."""
         packed = np.zeros(self.layout.shape, self.layout.dtype)
-        for name, array in self.arrays(observation).items():
+        for name, array in bridge.arrays_of(self.task, observation).items():
             (packed[name] if packed.dtype.names else packed)[...] = array
             largest = np.abs(array).max() if array.dtype.kind in "fi" else 0.0
             if not np.isfinite(largest):
