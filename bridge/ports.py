@@ -104,13 +104,10 @@ class WireListener:
         self.dropped = 0
         self.end_s = math.inf  # Unix time at which its certificate ends
         self.queue: queue.Queue[Heard] = queue.Queue(QUEUE_MESSAGES)
+        self.stopped = threading.Event()
+        """Ends `until_gone` after its next message; may be set in a signal's handler."""
         self._simulators: set[str] = set()
-        self._is_stopped = False
         self._zero_ns = time.time_ns() - time.monotonic_ns()
-
-    def stop(self) -> None:
-        """End `until_gone` after its next message; may be called from a signal's handler."""
-        self._is_stopped = True
 
     def next(self, timeout_s: float) -> Heard | None:
         with contextlib.suppress(queue.Empty):
@@ -123,7 +120,7 @@ class WireListener:
         Silence is no end: an edge runtime behind a router goes on sending without a simulator.
         """
         seen_s = time.monotonic()
-        while time.time() < self.end_s and not self._is_stopped:
+        while time.time() < self.end_s and not self.stopped.is_set():
             yield self.next(POLL_S)
             now_s = time.monotonic()
             if self._simulators:
@@ -268,7 +265,7 @@ def router(parser: Any) -> None:
 def run_router(arguments: Any) -> int:
     """Route until SIGTERM or ^C; without ``--tls`` everybody has all rights."""
     listens, connect = arguments.listen or [transport.DEFAULT_ENDPOINT], arguments.connect
-    tls, rules = transport.tls_for(arguments.tls, *listens, *[connect] * bool(connect)), None
+    tls, rules = transport.tls_for(arguments.tls, *listens, connect), None
     if tls is not None:
         access.check_name(tls.name, access.ROUTER)
         rules = access.rules_for_listener(arguments.vehicle_id or [DEFAULT_VEHICLE_ID])
@@ -307,7 +304,7 @@ def run_record(arguments: Any) -> int:
         print(f"recording {path}", flush=True)
         try:
             # A signal is the usual end of a recording: it must not cut a message in two.
-            with cli.quit_on_signals(listener.stop):
+            with cli.quit_on_signals(listener.stopped.set):
                 _listen(listener, writer, arguments.linger_s)
                 writer.finish()
         except OSError as error:

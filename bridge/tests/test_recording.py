@@ -299,7 +299,7 @@ def test_a_signal_cuts_no_message_in_two(tmp_path, monkeypatch):
     listener, path = WireListener(), tmp_path / "a.mcap"
     monkeypatch.setattr(listener, "next", lambda _: heard("state", encode(make_state(0))))
 
-    with whole_recording(path) as writer, quit_on_signals(listener.stop):
+    with whole_recording(path) as writer, quit_on_signals(listener.stopped.set):
         copy = writer._copies.write
 
         def signalled(one):
