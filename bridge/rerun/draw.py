@@ -343,13 +343,11 @@ def run(arguments: Any, stage: Callable[[Any], Iterator[Heard]] | None = None) -
 
     if arguments.foxglove and (arguments.port or arguments.recording):
         raise UserError("--foxglove PORT listens: it goes with neither --port nor F.mcap")
-    sink, opened = "", _foxglove
-    if not arguments.foxglove:
-        sink, opened = shown.check_sink(arguments.sink, arguments.port), _rerun
+    sink = "" if arguments.foxglove else shown.check_sink(arguments.sink, arguments.port)
     with (
         sigterm_as_interrupt(),
         open_source(arguments) as all_heard,
-        opened(arguments, sink) as show,
+        _rerun(arguments, sink) if sink else _foxglove(arguments.foxglove) as show,
     ):
         try:
             for heard in stage(all_heard) if stage else filter(None, all_heard):
@@ -377,7 +375,7 @@ def _rerun(arguments: Any, sink: str) -> Iterator[Callable[[Heard], None]]:
 
 
 @contextlib.contextmanager
-def _foxglove(arguments: Any, sink: str) -> Iterator[Callable[[Heard], None]]:
+def _foxglove(port: int) -> Iterator[Callable[[Heard], None]]:
     """Yield a function that shows a message in Foxglove; UserError where the port is taken."""
     from bridge.recording import ENCODING, SCHEMA_ENCODING, Schema, ViewerCopies
 
@@ -385,13 +383,12 @@ def _foxglove(arguments: Any, sink: str) -> Iterator[Callable[[Heard], None]]:
         import foxglove
     except ImportError:
         raise UserError("--foxglove needs its SDK: pip install 'phil-hil[foxglove]'") from None
-    port, context = arguments.foxglove, foxglove.Context()
+    context = foxglove.Context()
 
     @functools.cache
     def channel(topic: str, schema: Schema) -> Any:
         fields = foxglove.Schema(name=schema[0], encoding=SCHEMA_ENCODING, data=schema[1])
-        options: Any = {"message_encoding": ENCODING, "schema": fields, "context": context}
-        return foxglove.Channel(topic, **options)
+        return foxglove.Channel(topic, schema=fields, message_encoding=ENCODING, context=context)
 
     def add(topic: str, schema: Schema, now_ns: int, data: bytes) -> None:
         channel(topic, schema).log(data, log_time=now_ns)
