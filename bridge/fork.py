@@ -102,9 +102,9 @@ def read_episodes(
             episode = RecordedEpisode(path, vehicle_id, len(drives), *about)
             episode = drives.setdefault((message.origin.session, message.episode), episode)
             episode.waited = message.waited
-            if len(message.applied or ()) == len(episode.task.action):
-                step = message.step - message.waited - 1
-                episode.applied[step] = list(message.applied or ()), message.braked
+            applied = message.applied or []
+            if len(applied) == len(episode.task.action):
+                episode.applied[message.step - message.waited - 1] = applied, message.braked
         elif isinstance(message, State | Command):
             drive = drives.get((message.session, message.episode))
             if drive is not None and number in (None, drive.number):

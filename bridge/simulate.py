@@ -107,9 +107,8 @@ def _drive(
     if is_same := edge.manifest.text == task.text:
         task = msgspec.structs.replace(task, action=edge.manifest.action)  # with the policy's stops
     origin = Origin(session=port.session, environment=asked.env, latency=network, **how)
-    runner = EpisodeRunner(environment, clock, port.publish_scene, task, origin)
-    if edge.vehicle != NONE:
-        runner.rearm_command = rearm
+    rearm = "" if edge.vehicle == NONE else rearm
+    runner = EpisodeRunner(environment, clock, port.publish_scene, task, origin, rearm)
     if not is_same:
         runner.show_task(asked.seed)
         time.sleep(task.control_period_s)  # So that its safe stop still finds our end of the wire.
