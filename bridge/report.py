@@ -43,13 +43,13 @@ class EpisodeResult:
     """
 
     seed: int
-    outcome: str
-    distance_m: float
-    reward: float
-    time_s: float
-    lateral_acceleration_mps2: float | None
-    longitudinal_acceleration_mps2: float | None
-    steps: int
+    outcome: str = ""
+    distance_m: float = 0.0
+    reward: float = 0.0
+    time_s: float = 0.0
+    lateral_acceleration_mps2: float | None = None
+    longitudinal_acceleration_mps2: float | None = None
+    steps: int = 0
     actions: list[list[float]] = field(default_factory=list, repr=False)
 
 

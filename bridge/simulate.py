@@ -224,7 +224,7 @@ class EpisodeRunner:
         self.clock.begin(episode, seed)
         self._adapter.last = self._adapter.hands_off
         self.origin = msgspec.structs.replace(self.origin, seed=seed)
-        result = EpisodeResult(seed, "", 0.0, 0.0, 0.0, None, None, 0)
+        result = EpisodeResult(seed)
         applied: dict[str, Any] = {}  # The scene's fields about the last step
         accelerations, ended, waited, waits = [], False, 0, bool(self.rearm_command)
         apply = vehicle_action if isinstance(self.clock, VehicleClock) else policy_action

@@ -301,7 +301,7 @@ class Drive:
     def __init__(self, env: Any, seed: int, noise_std: float = 0.0) -> None:
         self.env, self.noise_std = env, noise_std
         self.over = False
-        self.result = EpisodeResult(seed, "", 0.0, 0.0, 0.0, None, None, 0)
+        self.result = EpisodeResult(seed)
         """Complete once the episode is over."""
         self.observation, _ = env.reset(seed=seed)
         self._noise = np.random.default_rng([seed, 1])

@@ -68,9 +68,8 @@ def _from_above(env: Any) -> tuple[SeenScene | None, Any]:
 
 def lay_out(scene: SeenScene | None) -> rrb.Blueprint:
     """Lay out the views; ``scene`` fixes the ground shown (None: as rerun sees fit)."""
-    left = rrb.Vertical(draw.road_view(scene), draw.sees_view(), row_shares=[3, 1.4])
     right = rrb.Vertical(*(draw.plot_view(*plot) for plot in PLOTS.items()))
-    return draw.two_columns(left, right, [3, 2], "step")
+    return draw.two_columns(scene, right, "step")
 
 
 @contextmanager

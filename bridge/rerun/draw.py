@@ -143,11 +143,6 @@ def plot_view(origin: str, title: str) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(origin=origin, name=title, plot_legend=legend, axis_x=axis)
 
 
-def lanes_view(origin: str, title: str) -> rrb.StateTimelineView:
-    axis = rrb.TimeAxis(view_range=WHOLE)
-    return rrb.StateTimelineView(origin=origin, name=title, time_view=axis)
-
-
 def road_view(scene: SeenScene | None) -> rrb.Spatial2DView:
     """Make the view from above of the scene's path; it follows a car that leaves it."""
     look: dict[str, Any] = {"name": "From above", "background": list(shown.GROUND)}
@@ -158,7 +153,7 @@ def road_view(scene: SeenScene | None) -> rrb.Spatial2DView:
     return rrb.Spatial2DView(origin=CAMERA, contents="/road/**", visual_bounds=bounds, **look)
 
 
-def sees_view(frames: bool = True) -> rrb.Horizontal:
+def sees_view(frames: bool) -> rrb.Horizontal:
     views: list[Any] = [plot_view("observation", "Policy sees")]
     if frames:
         view = rrb.Spatial2DView
@@ -169,10 +164,12 @@ def sees_view(frames: bool = True) -> rrb.Horizontal:
 
 
 def two_columns(
-    left: rrb.Container, right: rrb.Container, column_shares: list[int], timeline: str
+    scene: SeenScene | None, right: rrb.Container, timeline: str, frames: bool = True
 ) -> rrb.Blueprint:
+    """Lay out the road above what the policy sees, and ``right`` of both the other views."""
+    left = rrb.Vertical(road_view(scene), sees_view(frames), row_shares=[3, 1.4])
     return rrb.Blueprint(
-        rrb.Horizontal(left, right, column_shares=column_shares),
+        rrb.Horizontal(left, right, column_shares=[3, 2]),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(state="collapsed", timeline=timeline),
@@ -196,11 +193,11 @@ STATES = {"mode/mode": MODES, "mode/reason": {NO_REASON: GREY}, "mode/shadow": S
 
 
 def lay_out(scene: SeenScene | None, pictures: bool = True) -> rrb.Blueprint:
-    left = rrb.Vertical(road_view(scene), sees_view(pictures), row_shares=[3, 1.4])
-    mode = lanes_view("mode", "Mode, and why it does not drive")
+    title, axis = "Mode, and why it does not drive", rrb.TimeAxis(view_range=WHOLE)
+    mode = rrb.StateTimelineView(origin="mode", name=title, time_view=axis)
     plots = [plot_view(*plot) for plot in PLOTS]
     right = rrb.Vertical(mode, *plots, row_shares=[1.5, *[1] * len(plots)])
-    return two_columns(left, right, [3, 2], "sim_time")
+    return two_columns(scene, right, "sim_time", pictures)
 
 
 class WireLog:
