@@ -102,11 +102,11 @@ def _export(drive: RecordedDrive, folder: Path) -> int:
             path = folder / f"videos/{key}/{FIRST}.mp4"
             columns[key], features[key] = _encode(path, rate, arrays)
     _write_tables(folder, task.task, rate, columns, features, bounds)
-    count = len(bounds) - 1
+    episodes = len(bounds) - 1
     info = {
         "codebase_version": "v3.0", "fps": int(rate) if rate.denominator == 1 else float(rate),
         "robot_type": None if drive.vehicle == NONE else drive.vehicle,
-        "total_episodes": count, "total_tasks": 1, "splits": {"train": f"0:{count}"},
+        "total_episodes": episodes, "total_tasks": 1, "splits": {"train": f"0:{episodes}"},
         "chunks_size": 1000, "data_files_size_in_mb": 100, "video_files_size_in_mb": 200,
         "data_path": f"data/{FILE}.parquet", "video_path": f"videos/{{video_key}}/{FILE}.mp4",
         "total_frames": bounds[-1], "features": features,

@@ -136,9 +136,11 @@ class WireListener:
     def watch(self, sample: zenoh.Sample) -> None:
         key, here = str(sample.key_expr), sample.kind != zenoh.SampleKind.DELETE
         if key.endswith("/simulator") and "*" not in key:
-            (self._simulators.add if here else self._simulators.discard)(key)
             if here:
+                self._simulators.add(key)
                 self.simulator_seen.set()
+            else:
+                self._simulators.discard(key)
         self._put(sample, bytes([here]), size=1)
 
     def _put(self, sample: zenoh.Sample, payload: bytes, size: int) -> None:

@@ -130,8 +130,7 @@ def heard_of(recording: Recording, vehicle_id: str) -> Iterator[Heard]:
     for channel, message in recording.messages():
         vehicle, topic = _wire_topic(channel)
         if vehicle == vehicle_id:
-            data = message.data
-            yield Heard(channel.topic, topic, data, message.log_time, len(data))
+            yield Heard(channel.topic, topic, message.data, message.log_time, len(message.data))
 
 
 def valid_messages(recording: Recording, vehicle_id: str) -> Iterator[tuple[Heard, Any]]:

@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from highway_env.envs.common.observation import OccupancyGridObservation
-from highway_env.road.lane import CircularLane, StraightLane
+from highway_env.road.lane import StraightLane
 
 
 def mark_road(grid: OccupancyGridObservation, layer: int, distance_m: float = 100.0) -> None:
@@ -21,12 +21,10 @@ def mark_road(grid: OccupancyGridObservation, layer: int, distance_m: float = 10
         along = np.arange(at - distance_m, at + distance_m, spacing).clip(0, lane.length)
         if type(lane) is StraightLane:
             points.append(lane.start + along[:, None] * lane.direction)
-        elif type(lane) is CircularLane:
+        else:  # A CircularLane: the racetrack has no other kind
             angle = lane.direction * along / lane.radius + lane.start_phase
             around = np.stack([np.cos(angle), np.sin(angle)], 1)
             points.append(lane.center + lane.radius * around)
-        else:
-            points.append(np.array([lane.position(each, 0) for each in along]))
     relative = np.concatenate(points) - ego.position
     if grid.align_to_vehicle_axes:
         cos, sin = np.cos(ego.heading), np.sin(ego.heading)
