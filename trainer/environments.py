@@ -8,6 +8,7 @@ last step, the outcome.
 import copy
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -80,7 +81,7 @@ def make_environment(
         raise UserError(f"success is not for {name}, which itself says how an episode ended")
     scenario: Any = gymnasium.make(SCENARIOS[name], scene=scene).unwrapped
     if printed_reward:
-        scenario.config = scenario.config.with_printed_reward()
+        scenario.config = replace(scenario.config, **{scenario.config.scaled: 1.0})
     scenario.control_period_s = bridge.describe(scenario, period_s).control_period_s
     return scenario
 
@@ -101,6 +102,14 @@ def entries_of(observations: NDArray[Any], plain: str) -> dict[str, NDArray[Any]
     """Return observations by the entry names of a policy file; a single entry is ``plain``."""
     names = observations.dtype.names
     return {name: observations[name] for name in names} if names else {plain: observations}
+
+
+def as_array(layout: ReplayLayout, entries: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
+    """Pack an observation's entries into one array."""
+    packed = np.zeros(layout.shape, layout.dtype)
+    for name, entry in entries.items():
+        (packed[name] if packed.dtype.names else packed)[...] = entry
+    return packed
 
 
 def own_environment(env: Any) -> Any:
@@ -250,16 +259,15 @@ class Adapted(bridge.Adapter):
 
     def _as_array(self, observation: Any) -> NDArray[Any]:
         """Pack an observation into one array; UserError for a number that is not finite."""
-        packed = np.zeros(self.layout.shape, self.layout.dtype)
-        for name, array in bridge.arrays_of(self.task, observation).items():
-            (packed[name] if packed.dtype.names else packed)[...] = array
+        entries = bridge.arrays_of(self.task, observation)
+        for name, array in entries.items():
             largest = np.abs(array).max() if array.dtype.kind in "fi" else 0.0
             if not np.isfinite(largest):
                 raise UserError(f"{self.scenario} observes a number in {name} that is not finite")
             if largest > BEARABLE:
                 advice = "scale them, or no network learns from them"
                 bridge.say_once(f"{self.scenario}: {name} exceeds {BEARABLE:g}; {advice}")
-        return packed
+        return as_array(self.layout, entries)
 
 
 class _ScaledExpert(Expert):

@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pkgutil import resolve_name
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -41,12 +41,8 @@ class ScenarioConfig:
     goal_m: float = 0.0  # Distance from start to goal
     goal_reward: float = 10.0
     fail_reward: float = -10.0
-    scaled: ClassVar[str]  # The field that scales the third term of the reward
-
-    def with_printed_reward(self) -> Self:
-        """Return a copy with eq. 31 or 32 as it is printed, but for the latter's sign."""
-        change: dict[str, Any] = {self.scaled: 1.0}
-        return replace(self, **change)
+    scaled: ClassVar[str]
+    """The field that scales the third term of the reward; 1 in eq. 31 and 32 as printed."""
 
 
 class EgoVehicle(Vehicle):
@@ -83,32 +79,6 @@ class EgoVehicle(Vehicle):
 
     def on_state_update(self) -> None:
         """Skip the lane look-up: the planned path says where the car is."""
-
-
-EXPONENT = 4.0
-LEAST_GAP_M = 0.1
-"""Smaller gaps count as this, so that none is divided by 0; at 0 the cars crash anyway."""
-
-
-def idm_acceleration(
-    kind: VehicleType,
-    speed_mps: float,
-    desired_mps: float,
-    gap_m: float = math.inf,
-    closing_mps: float = 0.0,
-    time_gap_factor: float = 1.0,
-) -> float:
-    """Return the acceleration, m/s2, of a vehicle that is ``closing_mps`` faster than its leader.
-
-    ``gap_m`` is bumper to bumper, infinite without a leader; ``time_gap_factor`` as in ``equip``.
-    """
-    a, b = kind.acceleration_mps2, kind.deceleration_mps2
-    approach_m = speed_mps * closing_mps / (2.0 * math.sqrt(a * b))
-    wanted_m = kind.standstill_gap_m + max(
-        0.0, speed_mps * time_gap_factor * kind.time_gap_s + approach_m
-    )
-    free = 1.0 - (speed_mps / desired_mps) ** EXPONENT
-    return a * (free - (wanted_m / max(gap_m, LEAST_GAP_M)) ** 2)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from highway_env.road.road import Road
 from numpy.typing import NDArray
 
 from trainer.scenarios import Scene, base
@@ -81,54 +80,9 @@ SCENES: dict[Scene, CongestionConfig] = {
 LANES = 3
 EGO_LANE = 1  # The middle one, y = 0; lane 0 is to its left
 REACH_M = 200.0  # How far the road goes on before start and goal
-
-
-def spawn_traffic(
-    road: Road, ego: base.EgoVehicle, config: CongestionConfig, random: np.random.Generator
-) -> list[base.TrafficVehicle]:
-    jam_mps = float(random.uniform(*config.jam_speed_mps))
-    cars: list[base.TrafficVehicle] = []
-    for lane in range(LANES):
-        first_mps = jam_mps + float(random.uniform(*config.lane_speed_mps))
-        types, x = (_own_lane if lane == EGO_LANE else _side_lane)(config, random)
-        speeds = [float(v) for v in random.uniform(*config.traffic_speed_mps, size=len(x))]
-        own = base.queue(road, ("start", "end", lane), [REACH_M + place for place in x], speeds)
-        for car in own:
-            car.target_speed = config.desired_speed_mps
-        if lane == EGO_LANE and config.cars_behind:
-            own[1].leader = ego
-        base.equip(own, types, config.time_gap_factor)
-        # A lane's first car drives at the jam's speed; the others want to go faster.
-        own[0].speed = own[0].target_speed = first_mps
-        cars += own
-    for car in cars:
-        car.position[1] += float(random.uniform(*config.lane_offset_m))
-    return cars
-
-
-def _side_lane(
-    config: CongestionConfig, random: np.random.Generator
-) -> tuple[list[base.VehicleType], list[float]]:
-    """Draw a neighbouring lane's vehicles, and their places along it in m."""
-    types = base.draw_types(config.traffic_mix, config.side_cars, random)
-    x = [float(random.uniform(*config.side_front_m))]
-    for ahead, behind in itertools.pairwise(types):
-        x.append(x[-1] - base.bodies_m(behind, ahead) - float(random.uniform(*config.gap_m)))
-    return types, x
-
-
-def _own_lane(
-    config: CongestionConfig, random: np.random.Generator
-) -> tuple[list[base.VehicleType], list[float]]:
-    """Draw the ego lane's vehicles and places, one ahead; those behind follow the ego car."""
-    types = base.draw_types(config.traffic_mix, 1 + config.cars_behind, random)
-    nose_m = 0.5 * base.EgoVehicle.LENGTH
-    x = [nose_m + float(random.uniform(*config.ahead_gap_m)) + 0.5 * types[0].length_m]
-    tail_m = -nose_m
-    for kind in types[1:]:
-        x.append(tail_m - float(random.uniform(*config.gap_m)) - 0.5 * kind.length_m)
-        tail_m = x[-1] - 0.5 * kind.length_m
-    return types, x
+EXPONENT = 4.0  # Of the intelligent driver model
+LEAST_GAP_M = 0.1
+"""Smaller gaps count as this, so that none is divided by 0; at 0 the cars crash anyway."""
 
 
 class CongestionEnv(base.DrivingEnv):
@@ -211,9 +165,52 @@ class CongestionEnv(base.DrivingEnv):
             for limits in (c.start_offset_m, c.start_heading_rad, c.ego_speed_mps)
         )
         self.ego = base.EgoVehicle(self.road, (0.0, offset_m), heading_rad, speed_mps)
-        self.traffic = spawn_traffic(self.road, self.ego, c, random)
+        self.traffic = self._spawn_traffic()
         self._steering = self._last_steering = 0.0
         self._braking = False
+
+    def _spawn_traffic(self) -> list[base.TrafficVehicle]:
+        c, random = self.config, self.np_random
+        jam_mps = float(random.uniform(*c.jam_speed_mps))
+        cars: list[base.TrafficVehicle] = []
+        for lane in range(LANES):
+            first_mps = jam_mps + float(random.uniform(*c.lane_speed_mps))
+            types, x = self._own_lane() if lane == EGO_LANE else self._side_lane()
+            speeds = [float(v) for v in random.uniform(*c.traffic_speed_mps, size=len(x))]
+            places = [REACH_M + place for place in x]
+            own = base.queue(self.road, ("start", "end", lane), places, speeds)
+            for car in own:
+                car.target_speed = c.desired_speed_mps
+            if lane == EGO_LANE and c.cars_behind:
+                own[1].leader = self.ego
+            base.equip(own, types, c.time_gap_factor)
+            # A lane's first car drives at the jam's speed; the others want to go faster.
+            own[0].speed = own[0].target_speed = first_mps
+            cars += own
+        for car in cars:
+            car.position[1] += float(random.uniform(*c.lane_offset_m))
+        return cars
+
+    def _side_lane(self) -> tuple[list[base.VehicleType], list[float]]:
+        """Draw a neighbouring lane's vehicles, and their places along it in m."""
+        c, random = self.config, self.np_random
+        types = base.draw_types(c.traffic_mix, c.side_cars, random)
+        x = [float(random.uniform(*c.side_front_m))]
+        for ahead, behind in itertools.pairwise(types):
+            x.append(x[-1] - base.bodies_m(behind, ahead) - float(random.uniform(*c.gap_m)))
+        return types, x
+
+    def _own_lane(self) -> tuple[list[base.VehicleType], list[float]]:
+        """Draw the ego lane's vehicles and places, one ahead; those behind follow the ego car."""
+        c, random = self.config, self.np_random
+        types = base.draw_types(c.traffic_mix, 1 + c.cars_behind, random)
+        nose_m = 0.5 * base.EgoVehicle.LENGTH
+        x = [nose_m + float(random.uniform(*c.ahead_gap_m)) + 0.5 * types[0].length_m]
+        tail_m = -nose_m
+        for kind in types[1:]:
+            x.append(tail_m - float(random.uniform(*c.gap_m)) - 0.5 * kind.length_m)
+            tail_m = x[-1] - 0.5 * kind.length_m
+        return types, x
 
     def _pedals(self) -> float:
         """Return the ego car's acceleration in m/s2: the IDM's, or the brake's."""
@@ -225,11 +222,17 @@ class CongestionEnv(base.DrivingEnv):
             gap_m = float(leader.position[0] - self.ego.position[0])
             gap_m -= 0.5 * (leader.LENGTH + self.ego.LENGTH)
             closing_mps = self.ego.speed - leader.speed
-        speed_mps, wanted_mps = self.ego.speed, c.desired_speed_mps
-        idm = base.idm_acceleration(
-            base.CAR, speed_mps, wanted_mps, gap_m, closing_mps, c.time_gap_factor
-        )
-        return max(idm, -c.brake_mps2)
+        return max(self._idm_mps2(gap_m, closing_mps), -c.brake_mps2)
+
+    def _idm_mps2(self, gap_m: float, closing_mps: float) -> float:
+        """Follow a leader ``gap_m`` ahead, bumper to bumper, and ``closing_mps`` slower."""
+        car, speed_mps = base.CAR, self.ego.speed
+        a, b = car.acceleration_mps2, car.deceleration_mps2
+        time_gap_m = speed_mps * self.config.time_gap_factor * car.time_gap_s
+        approach_m = speed_mps * closing_mps / (2.0 * math.sqrt(a * b))
+        wanted_m = car.standstill_gap_m + max(0.0, time_gap_m + approach_m)
+        free = 1.0 - (speed_mps / self.config.desired_speed_mps) ** EXPONENT
+        return a * (free - (wanted_m / max(gap_m, LEAST_GAP_M)) ** 2)
 
     def _leader(self) -> base.TrafficVehicle | None:
         """Return the nearest vehicle ahead in the ego car's corridor, in any lane."""
