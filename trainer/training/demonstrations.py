@@ -24,7 +24,7 @@ from bridge.recording import Recording, choose_vehicle, valid_messages
 from edge_runtime.manifest import Layout
 from edge_runtime.util import UserError
 from edge_runtime.wire import DRIVE, Feedback, State
-from trainer.environments import inner, task_of
+from trainer.environments import as_array, inner, task_of
 from trainer.evaluation import Drive, Driver
 from trainer.learner.replay import Transition
 from trainer.person.recording import TOPIC, RecordedStep, find_recordings, read_episodes, read_steps
@@ -111,6 +111,10 @@ def _as_recorded(path: Path, env: Any) -> Iterator[Episode]:
                 raise UserError(f"{path} is of {message.task}, not of {task.text}")
             drives.setdefault((message.session, message.episode), []).append((message, feedback))
     recording.say_trouble()
+
+    def seen(state: State) -> NDArray[Any]:
+        return as_array(env.layout, layout.arrays(state.observation))
+
     ever_moved = False
     for drive in drives.values():
         steps = [
@@ -122,19 +126,12 @@ def _as_recorded(path: Path, env: Any) -> Iterator[Episode]:
             continue
         ever_moved, steps = True, steps[rows[0] : rows[-1] + 1]
         yield [
-            Transition(_array(state, layout, env), inner(env.action_range, report.action), 0.0,
-                       _array(after, layout, env), False, n == len(steps), report.mode != DRIVE)
+            Transition(seen(state), inner(env.action_range, report.action), 0.0, seen(after),
+                       False, n == len(steps), report.mode != DRIVE)
             for n, (state, after, report) in enumerate(steps, 1)
         ]  # fmt: skip
     if not ever_moved:
         raise UserError(f"{path} shows no drive: the vehicle never moved, or nobody recorded it")
-
-
-def _array(state: State, layout: Layout, env: Any) -> NDArray[Any]:
-    observation = np.zeros(env.layout.shape, env.layout.dtype)
-    for name, array in layout.arrays(state.observation).items():
-        (observation[name] if observation.dtype.names else observation)[...] = array
-    return observation
 
 
 def _from_dataset(folder: Path, env: Any) -> Iterator[Episode]:
