@@ -258,7 +258,7 @@ def load_driver(policy: str, env: Any, public_key: str | None = None) -> tuple[D
             raise UserError(f"{policy} is for {task}, but {env.scenario} asks for {wanted}")
         return driver, driver.policy.policy_id
     if (path / MODEL_FILE).is_file():
-        return TogetherDriver(load_human_model(path, env)[0].eval().act), f"human:{path.name}"
+        return TogetherDriver(load_human_model(path, env).eval().act), f"human:{path.name}"
     if path.is_dir():
         actor, about = load_actor(path, env)
         return TogetherDriver(actor.eval().act), f"run:{path.name}:{about['episode']}"

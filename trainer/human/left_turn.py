@@ -15,6 +15,7 @@ from trainer.scenarios.left_turn import LeftTurnEnv
 from trainer.scenarios.picture import Rectangle, corners
 
 TABLE_STEP_M = 0.1
+SIDE_CLEARANCE_M = 0.3  # Room to the sides of a passing car
 
 
 @dataclass(frozen=True)
@@ -23,18 +24,17 @@ class PedalPlan:
 
     pedal: float = 1.0
     hold_s: float = 0.0
-    then_mps: float | None = None
-    """Full throttle up to this speed; None keeps the speed that the pedal led to."""
+    then_mps: float = 0.0  # Full throttle up to this speed; a faster car keeps its own
     then_brake: float = 0.0  # Instead of that: this share of the full brake, until the car stands
 
 
 class Crossing:
-    """Predicts conflicts in a left turn, with ``side_clearance_m`` beside passing cars."""
+    """Predicts conflicts in a left turn."""
 
-    def __init__(self, env: LeftTurnEnv, side_clearance_m: float) -> None:
+    def __init__(self, env: LeftTurnEnv) -> None:
         self.env = env
         config = env.config
-        lane_y, half_width_m = 0.5 * config.lane_width_m, 0.5 * EgoVehicle.WIDTH + side_clearance_m
+        lane_y, half_width_m = 0.5 * config.lane_width_m, 0.5 * EgoVehicle.WIDTH + SIDE_CLEARANCE_M
         stretch = [
             _stretch_in_strip(self._footprint(s_m), lane_y - half_width_m, lane_y + half_width_m)
             for s_m in np.arange(0.0, config.goal_m + 10.0, TABLE_STEP_M)
@@ -77,7 +77,7 @@ class Crossing:
                 speed_mps = min(max(speed_mps + held_mps2 * dt_s, 0.0), c.max_speed_mps)
             elif plan.then_brake:
                 speed_mps = max(speed_mps - plan.then_brake * c.brake_mps2 * dt_s, 0.0)
-            elif plan.then_mps is not None and speed_mps < plan.then_mps:
+            elif speed_mps < plan.then_mps:
                 speed_mps = min(speed_mps + c.throttle_mps2 * dt_s, plan.then_mps)
             positions.append(s_m)
         return np.array(positions), speed_mps
@@ -124,7 +124,6 @@ class LeftTurnHuman(Expert):
     APPROACH_MPS2 = 1.5
     """Comfortable deceleration towards the stop line; full brake is kept for surprises."""
     CRUISE_MPS = 5.2
-    SIDE_CLEARANCE_M = 0.3  # Room to the sides of a passing car
     GO = PedalPlan(then_mps=CRUISE_MPS)
 
     HOLD_S = 0.5  # Time for which the judged pedal is held: a person's reaction time
@@ -149,7 +148,7 @@ class LeftTurnHuman(Expert):
 
     def __init__(self, env: LeftTurnEnv) -> None:
         self.env = env
-        self.crossing = Crossing(env, self.SIDE_CLEARANCE_M)
+        self.crossing = Crossing(env)
         self.reset()
 
     def reset(self) -> None:

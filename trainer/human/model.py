@@ -100,15 +100,15 @@ class HumanModel(Driver):
         save_torch(directory / MODEL_FILE, state)
 
 
-def load_human_model(directory: Path, env: Any) -> tuple[Actor, dict[str, Any]]:
-    """Load a HUMAN_DIR: network and description; UserError: it holds no human model of ``env``."""
+def load_human_model(directory: Path, env: Any) -> Actor:
+    """Load the network of a HUMAN_DIR; UserError: it holds no human model of ``env``."""
     path = directory / MODEL_FILE
     state = load_torch(path)
     with util.fitting(f"{path} is not a human model of this project"):
         actor = Actor(state["action_size"], state["frames"], env.observation_space)
         check_trained_in(env, directory, state["scenario"])
-        actor.load_state_dict(state.pop("actor"))
-    return actor, state
+        actor.load_state_dict(state["actor"])
+    return actor
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -128,8 +128,7 @@ def _train(arguments: argparse.Namespace, config: HumanModelConfig, directory: P
     end_s = util.deadline_s(arguments.max_minutes)
     env = make_environment(arguments.scenario)
     about: dict[str, Any] = {"scenario": env.scenario, "seed": arguments.seed}
-    shape, space = env.action_space.shape, env.observation_space
-    model = HumanModel(config, arguments.seed, shape[0], space)
+    model = HumanModel(config, arguments.seed, env.action_space.shape[0], env.observation_space)
     if arguments.recordings is None:
         losses = imitate(model, env, arguments.seed)
     else:

@@ -315,11 +315,11 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
         raise NotImplementedError
 
     def _move(self, acceleration_mps2: float, steering_rad: float, max_speed_mps: float) -> None:
+        period_s = self.config.control_period_s
         for car in self.traffic:
             car.act()
         for car in self.traffic:
-            car.step(self.config.control_period_s)
-        period_s = self.config.control_period_s
+            car.step(period_s)
         self.ego.drive(acceleration_mps2, steering_rad, max_speed_mps, period_s)
         self.steps += 1
 

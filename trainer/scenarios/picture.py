@@ -71,7 +71,6 @@ class Rasteriser:
         self._centres = np.stack([left_m + steps_m, top_m + steps_m])
         """Centres of the columns and rows, m; the rows are padded, so that both fit into one
         array."""
-        self._column_x, self._row_y = self._centres[0], self._centres[1, :ROWS]
         self.background = np.full((ROWS, COLUMNS), GROUND, dtype=np.float32)
         """The still part of the picture, grey values [45, 80]."""
         for road in roads:
@@ -116,8 +115,8 @@ class Rasteriser:
         bottom = min(int((shape.y + reach_y - self.top_m) / pixel_m) + 1, ROWS)
         if left >= right or top >= bottom:
             return
-        dx = self._column_x[left:right] - shape.x
-        dy = (self._row_y[top:bottom] - shape.y)[:, None]
+        dx = self._centres[0, left:right] - shape.x
+        dy = (self._centres[1, top:bottom] - shape.y)[:, None]
         if sin == 0.0:
             # Parallel to the rows, as most traffic is: a row times a column instead of a field.
             along, across = dx, dy

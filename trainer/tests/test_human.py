@@ -9,13 +9,14 @@ import torch
 from hil_tests.tests.shared.commands import call
 from trainer.environments import expert_of, make_environment
 from trainer.evaluation import constant_driver
-from trainer.human import HumanModelConfig
+from trainer.human import MODEL_FILE, HumanModelConfig
 from trainer.human import model as model_module
 from trainer.human.guide import ASKED, Asking, HumanGuide, PoorHands, steps_held
 from trainer.human.model import HumanModel, imitate, load_human_model
 from trainer.person.tests.people import BRAKE, FULL, drive
 from trainer.scenarios.congestion import CongestionEnv
 from trainer.scenarios.left_turn import LeftTurnEnv
+from trainer.util import load_torch
 
 
 @pytest.mark.parametrize("kind", [LeftTurnEnv, CongestionEnv])
@@ -28,8 +29,8 @@ def test_training_is_reproducible_and_survives_saving(tmp_path, kind):
     frames = np.full((2, 45, 80), 70, np.uint8)
     assert models[0].act(frames) == models[1].act(frames)
     models[0].save(tmp_path, {"scenario": "left_turn"})
-    actor, about = load_human_model(tmp_path, make_environment("left_turn"))
-    assert about["demonstrations"] == models[0].demonstrations
+    actor = load_human_model(tmp_path, make_environment("left_turn"))
+    assert load_torch(tmp_path / MODEL_FILE)["demonstrations"] == models[0].demonstrations
     with torch.no_grad():
         assert actor(torch.from_numpy(frames)[None])[0].numpy() == models[0].act(frames)
 
@@ -47,8 +48,8 @@ def test_an_interrupted_training_leaves_the_model_of_its_episodes(
     assert call(capsys, *words)[0] == 130
     assert (tmp_path / "human").exists() == bool(driven)
     if driven:
-        _, about = load_human_model(tmp_path / "human", make_environment("left_turn"))
-        assert about["episodes"] == driven
+        assert load_human_model(tmp_path / "human", make_environment("left_turn"))
+        assert load_torch(tmp_path / "human" / MODEL_FILE)["episodes"] == driven
 
 
 @pytest.mark.parametrize(
