@@ -340,20 +340,17 @@ def drive_together(
     ``act`` has no memory: it returns actions [n, action size] for observations [n, ...].
     """
     noise_std = CONDITIONS[condition].noise_std
-    results: dict[int, EpisodeResult] = {}
-    waiting, free = deque(seeds), deque(envs)
-    under_way: list[Drive] = []
-    while waiting or under_way:
+    waiting, free, drives = deque(seeds), deque(envs), list[Drive]()
+    while waiting or not all(drive.over for drive in drives):
         while waiting and free:
-            under_way.append(Drive(free.popleft(), waiting.popleft(), noise_std))
+            drives.append(Drive(free.popleft(), waiting.popleft(), noise_std))
+        under_way = [drive for drive in drives if not drive.over]
         actions = act(np.stack([drive.observation for drive in under_way]))
         for drive, action in zip(under_way, actions, strict=True):
             drive.step(action)
-        for drive in (drive for drive in under_way if drive.over):
-            results[drive.result.seed] = drive.result
-            free.append(drive.env)
-        under_way = [drive for drive in under_way if not drive.over]
-    return [results[seed] for seed in seeds]
+            if drive.over:
+                free.append(drive.env)
+    return [drive.result for drive in drives]
 
 
 def drive_episodes(
@@ -361,7 +358,7 @@ def drive_episodes(
     driver: Driver,
     seeds: Iterable[int],
     condition: str = "nominal",
-    on_episode: Callable[[EpisodeResult], None] = lambda result: None,
+    on_episode: Callable[[EpisodeResult], object] = lambda result: None,
     latency: LatencySpec = NO_NETWORK,
     recorders: Sequence[Record] = (),
 ) -> list[EpisodeResult]:

@@ -15,7 +15,6 @@ from typing import Any
 
 from bridge.fork import ForkedEnvironment, find_fork
 from bridge.outcomes import DISCARDED, FAILED, GOAL, RESTARTED, STOPPED, TRUNCATED, UNKNOWN, UNTOLD
-from bridge.report import EpisodeResult
 from edge_runtime.cli import quit_on_signals
 from edge_runtime.files import check_writable
 from edge_runtime.util import UserError
@@ -328,12 +327,12 @@ def drive(
         while not sitting.stop and sitting.episode != episodes:
             yield seed_of((sitting.recorder.sitting << 32) + sitting.episode)
 
-    def ended(result: EpisodeResult) -> None:
-        sitting.end_episode(result.outcome)
-
     with suppress(GuideGone):
         vehicle, driver = PacedEnvironment(sitting.env, sitting), SharedWheel(sitting, policy)
-        drive_episodes(vehicle, driver, seeds(), on_episode=ended, recorders=[sitting.record])
+        drive_episodes(
+            vehicle, driver, seeds(), recorders=[sitting.record],
+            on_episode=lambda result: sitting.end_episode(result.outcome),
+        )  # fmt: skip
 
 
 def _environment(options: argparse.Namespace) -> tuple[Any, Callable[[int], int]]:
