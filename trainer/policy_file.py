@@ -30,8 +30,8 @@ OPSET = 17  # Readable by the oldest onnxruntime that a board may have
 
 
 def run(arguments: argparse.Namespace) -> int:
-    names = ("out", "scenario", "key")
-    made = export(arguments.run_dir, **{name: getattr(arguments, name) for name in names})
+    out, scenario, key = arguments.out, arguments.scenario, arguments.key
+    made = export(arguments.run_dir, out, scenario=scenario, key=key)
     signed = "signed" if arguments.key else "not signed"
     print(f"{arguments.out}: {signed}, policy_id {made.policy_id}")
     print(f"torch and onnxruntime differ by at most {made.max_difference:.1e}")

@@ -30,7 +30,6 @@ from edge_runtime.util import UserError, open_regular
 
 PERIOD_S = 0.1  # Control period of an environment that names none
 DEVICES = ("cpu", "cuda")
-CPU_INFO = Path("/proc/cpuinfo")
 Range = tuple[float, float]
 ANY: Range = (-math.inf, math.inf)
 FROM_ONE: Range = (1, math.inf)
@@ -213,7 +212,7 @@ def source_revision(directory: Path = Path(__file__).parent) -> str:
 def cpu_info() -> list[str]:
     """Return Linux' lines about each core; none elsewhere."""
     try:
-        return CPU_INFO.read_text(errors="replace").splitlines()
+        return Path("/proc/cpuinfo").read_text(errors="replace").splitlines()
     except OSError:
         return []
 
