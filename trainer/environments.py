@@ -137,11 +137,23 @@ def foresee(env: Any, observation: Any, action: Action, steps: int) -> list[Any]
 
 
 def check_foresight(env: Any) -> None:
-    """Raise UserError unless the environment can be deep-copied for look-ahead."""
+    """Raise UserError unless a deep copy of the environment drives on as the environment does.
+
+    A copy of gymnasium's MuJoCo and Box2D environments (``EzPickle``) has nothing of their state.
+    """
+    action = np.ones(env.action_space.shape, np.float32)
     try:
-        copy.deepcopy(env)
+        driven = copy.deepcopy(env)  # The run's own stays as it is.
+        driven.reset(seed=0)
+        driven.step(action)
+        copied = copy.deepcopy(driven)
+        seen, foreseen = (each.step(action)[0].tobytes() for each in (driven, copied))
     except Exception as error:  # An environment's own code may raise anything.
         raise UserError(f"{env.scenario} cannot be copied to look ahead: {error!r}") from error
+    if seen != foreseen:
+        raise UserError(
+            f"{env.scenario} cannot be copied to look ahead: the copy drives differently"
+        )
 
 
 def expert_of(env: Any, human: str = "expert") -> Expert:

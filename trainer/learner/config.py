@@ -197,8 +197,10 @@ class LearnerConfig:
     noise instead of the action, and a human takes over because of the noise. Default without
     human and pictures: 0.6, falling to 0.3."""
     exploration_searching: float = 0.0
-    """Standard deviation until the first success, where the environment reports it, or until
-    ``exploration_share`` is over; 0: no such phase. Default without human and pictures: 1."""
+    """Standard deviation in every other episode until one of the rest succeeds, or half of a
+    validation; 0: no such episodes. It has no bound, so that it outweighs a policy which has
+    learned that moving costs. Default without human and pictures: 4, mostly full actions. Where
+    the environment does not say whether an episode succeeded, only the first one searches."""
     exploration_correlation: float = 0.9
     """Correlation of the noise in two successive steps (the paper: 0). A critic cannot see what a
     tenth of a second of steering does, but it sees a second of it: lasting noise shows what an
@@ -307,7 +309,7 @@ RANGES = {
 """Ranges of these numbers; all others are at least 0."""
 
 UNGUIDED_NUMBERS = {
-    "exploration_searching": 1.0, "exploration_initial": 0.6, "exploration_final": 0.3,
+    "exploration_searching": 4.0, "exploration_initial": 0.6, "exploration_final": 0.3,
 }  # fmt: skip
 """Without a human only noise finds rewards, and without pictures it does little harm."""
 IMITATED_NUMBERS = {"cloning_batch_size": 128, "fresh_actors": 3}

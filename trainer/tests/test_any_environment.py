@@ -13,6 +13,7 @@ import onnx
 import pytest
 import torch
 from gymnasium.spaces import Box
+from gymnasium.utils import EzPickle
 
 from bridge import environments as bridge
 from edge_runtime.policy import load_policy
@@ -91,6 +92,20 @@ def test_an_environment_that_cannot_be_copied_is_refused_at_the_start(tmp_path):
     gymnasium.register("test/Shared-v0", f"{__name__}:Shared")
     with pytest.raises(UserError, match="a socket cannot be copied"):
         train(f"{__name__}:test/Shared-v0", out=tmp_path, algorithm="ppl_td3", episodes=1)
+
+
+class Forgetful(Rover, EzPickle):
+    """Its copy is a new one, which stands elsewhere."""
+
+    def __init__(self, **options):
+        EzPickle.__init__(self, **options)
+        Rover.__init__(self, **options)
+
+
+def test_an_environment_whose_copy_forgets_its_state_cannot_look_ahead(tmp_path):
+    gymnasium.register("test/Forgetful-v0", f"{__name__}:Forgetful")
+    with pytest.raises(UserError, match="drives differently"):
+        train(f"{__name__}:test/Forgetful-v0", out=tmp_path, algorithm="ppl_td3", episodes=1)
 
 
 def test_the_papers_networks_begin_as_ever():

@@ -15,6 +15,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bridge.outcomes import UNKNOWN
 from edge_runtime.util import UserError
 from trainer.evaluation import BEST_FILE, CHECKPOINT_FILE
 from trainer.learner.config import LearnerConfig
@@ -113,6 +114,21 @@ def test_the_human_leaves_after_so_many_episodes(tmp_path):
 def test_a_budget_in_steps_ends_the_run_with_the_episode_under_way(tmp_path):
     run = trained(tmp_path, 2, episodes=100, steps=5)
     assert (run.episode, run.steps) == (3, 6)
+
+
+@pytest.mark.parametrize(
+    ("outcome", "searched"),
+    [
+        ("collision", [True, False] * 2),
+        ("goal", [True] + [False] * 3),
+        (UNKNOWN, [True] + [False] * 3),
+    ],
+)
+def test_every_other_episode_searches_until_the_rest_succeed(tmp_path, outcome, searched):
+    run = trained(tmp_path, 60, outcome, episodes=4, exploration_searching=4.0)
+    assert [told.exploration_std for told in run.told] == [4.0 * each for each in searched]
+    for episode, is_searching in zip(np.reshape(run.env.actions, (4, 60)), searched, strict=True):
+        assert {-1.0, 1.0} < {*episode} if is_searching else {*episode} == {POLICY}
 
 
 def bad_update(run):

@@ -229,7 +229,7 @@ class TrainingRun:
         """Episodes driven, and environment steps in those that a person has not discarded."""
         self.quitting = False  # End ``train`` after the episode under way
         self.has_succeeded = False
-        """Whether an episode has succeeded, in training or validation, or success is unknown."""
+        """Whether an episode without search or half of a validation has, or success is unknown."""
         self._shown_steps = 0  # Human steps in demonstrations; the first episode's row counts them
         if resume:
             path = run_dir / CHECKPOINT_FILE
@@ -259,8 +259,7 @@ class TrainingRun:
                 at_end = self.over or self.guide.stop or time.monotonic() > deadline_s
                 due = self._due(before)
                 self.validation.after(metrics, self.episode, due, at_end)
-                self.has_succeeded |= metrics.outcome == GOAL or not is_told([metrics.outcome])
-                self.has_succeeded |= due and metrics.validation_success > 0.0
+                self.has_succeeded |= due and metrics.validation_success >= 0.5
                 metrics_writer.add(metrics)
                 ending = at_end or self.quitting  # Read once: a signal may change it.
                 if ending or self.episode % self.config.checkpoint_every == 0:
@@ -278,6 +277,8 @@ class TrainingRun:
         """Train one episode, without validation and checkpoint; UserError where it diverges."""
         metrics = self._episode()
         self.learning.check_weights()
+        succeeded = metrics.outcome == GOAL and not self._searching
+        self.has_succeeded |= succeeded or not is_told([metrics.outcome])
         self.episode += 1
         self.steps = metrics.total_steps
         return metrics
@@ -399,15 +400,22 @@ class TrainingRun:
         if not np.isfinite(action).all():  # Never drive a car with them.
             raise diverged("actions")
         c, std = self.config.learner, self._exploration_std()
+        bound = math.inf if self._searching else c.exploration_bound
         self._noise = equations.correlated(self._noise, c.exploration_correlation, self.exploration)
-        noise = equations.exploration_noise(std, c.exploration_bound, self._noise)
+        noise = equations.exploration_noise(std, bound, self._noise)
         return np.clip(action + noise, -1.0, 1.0)
+
+    @property
+    def _searching(self) -> bool:
+        """Whether this episode searches: every other one does, until the others succeed."""
+        searches = bool(self.config.learner.exploration_searching)
+        return searches and not self.has_succeeded and self.episode % 2 == 0
 
     def _exploration_std(self) -> float:
         c = self.config.learner
-        left = max(0.0, 1.0 - self.progress / c.exploration_share)
-        if left and not self.has_succeeded and c.exploration_searching:
+        if self._searching:
             return c.exploration_searching
+        left = max(0.0, 1.0 - self.progress / c.exploration_share)
         return c.exploration_final + (c.exploration_initial - c.exploration_final) * left
 
     def _beta(self) -> float:
