@@ -139,21 +139,24 @@ def foresee(env: Any, observation: Any, action: Action, steps: int) -> list[Any]
 def check_foresight(env: Any) -> None:
     """Raise UserError unless a deep copy of the environment drives on as the environment does.
 
-    A copy of gymnasium's MuJoCo and Box2D environments (``EzPickle``) has nothing of their state.
+    Ten steps must be the same. A copy of gymnasium's MuJoCo and Box2D environments (``EzPickle``)
+    has nothing of their state.
     """
-    action = np.ones(env.action_space.shape, np.float32)
+    action, steps = np.ones(env.action_space.shape, np.float32), 10
     try:
         driven = copy.deepcopy(env)  # The run's own stays as it is.
-        driven.reset(seed=0)
-        driven.step(action)
-        copied = copy.deepcopy(driven)
-        seen, foreseen = (each.step(action)[0].tobytes() for each in (driven, copied))
+        observation, _ = driven.reset(seed=0)
+        for _ in range(steps):  # Away from the start, where a copy without state would stand
+            observation, _, terminated, truncated, _ = driven.step(action)
+            if terminated or truncated:
+                observation, _ = driven.reset(seed=0)
+                break
+        foreseen = foresee(driven, observation, action, steps)
+        seen = [observation, *(driven.step(action)[0] for _ in foreseen[1:])]
     except Exception as error:  # An environment's own code may raise anything.
         raise UserError(f"{env.scenario} cannot be copied to look ahead: {error!r}") from error
-    if seen != foreseen:
-        raise UserError(
-            f"{env.scenario} cannot be copied to look ahead: the copy drives differently"
-        )
+    if any(one.tobytes() != other.tobytes() for one, other in zip(seen, foreseen, strict=True)):
+        raise UserError(f"{env.scenario} cannot be copied to look ahead: a copy drives differently")
 
 
 def expert_of(env: Any, human: str = "expert") -> Expert:

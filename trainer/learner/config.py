@@ -197,10 +197,10 @@ class LearnerConfig:
     noise instead of the action, and a human takes over because of the noise. Default without
     human and pictures: 0.6, falling to 0.3."""
     exploration_searching: float = 0.0
-    """Standard deviation in every other episode until one of the rest succeeds, or half of a
-    validation; 0: no such episodes. It has no bound, so that it outweighs a policy which has
-    learned that moving costs. Default without human and pictures: 4, mostly full actions. Where
-    the environment does not say whether an episode succeeded, only the first one searches."""
+    """Standard deviation of the noise in every other episode, until one of the rest succeeds or
+    half of a validation; 0: no such episodes. The noise has no bound there: it must outweigh a
+    policy that has learned that moving costs. Default without human and pictures: 4, mostly full
+    actions. Only the first episode searches if it does not tell whether it succeeded."""
     exploration_correlation: float = 0.9
     """Correlation of the noise in two successive steps (the paper: 0). A critic cannot see what a
     tenth of a second of steering does, but it sees a second of it: lasting noise shows what an
@@ -213,7 +213,7 @@ class LearnerConfig:
     ``exploration_final``, counted in steps: in episodes, a policy that fails early would stop
     exploring before it has learned anything. The paper gives no schedule."""
     exploration_bound: float = 1.0
-    """Bound of the exploration noise (table A5: c)."""
+    """Bound of the exploration noise (table A5: c), but for searching episodes."""
     replay_capacity: int = 100_000
     """Transitions kept (table A6)."""
     alpha: float = 0.6

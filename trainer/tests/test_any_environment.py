@@ -94,16 +94,41 @@ def test_an_environment_that_cannot_be_copied_is_refused_at_the_start(tmp_path):
         train(f"{__name__}:test/Shared-v0", out=tmp_path, algorithm="ppl_td3", episodes=1)
 
 
-class Forgetful(Rover, EzPickle):
-    """Its copy is a new one, which stands elsewhere."""
+class Brief(gymnasium.Env):
+    """A coarse picture of a slow cart: one step does not show. A full action ends it, at once."""
 
-    def __init__(self, **options):
-        EzPickle.__init__(self, **options)
-        Rover.__init__(self, **options)
+    observation_space = Box(0, 255, (4, 4, 1), np.uint8)
+    action_space = Box(-1.0, 1.0, (1,), np.float32)
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+    most = 0.9
+
+    def __init__(self, render_mode=None):
+        self.at, self.over = 0, False
+
+    def reset(self, *, seed=None, options=None):
+        self.at, self.over = 0, False
+        return np.zeros((4, 4, 1), np.uint8), {}
+
+    def step(self, action):
+        assert not self.over, "step after the end"
+        self.at, self.over = self.at + 1, bool(action[0] > self.most)
+        return np.full((4, 4, 1), self.at // 8, np.uint8), 0.0, self.over, False, {}
+
+
+class Forgetful(EzPickle, Brief):
+    """The same without an end. Its copy begins anew."""
+
+    most = 1.0
+
+    def __init__(self, render_mode=None):
+        EzPickle.__init__(self)
+        Brief.__init__(self)
 
 
 def test_an_environment_whose_copy_forgets_its_state_cannot_look_ahead(tmp_path):
     gymnasium.register("test/Forgetful-v0", f"{__name__}:Forgetful")
+    gymnasium.register("test/Brief-v0", f"{__name__}:Brief")
+    check_foresight(make_environment(f"{__name__}:test/Brief-v0"))
     with pytest.raises(UserError, match="drives differently"):
         train(f"{__name__}:test/Forgetful-v0", out=tmp_path, algorithm="ppl_td3", episodes=1)
 

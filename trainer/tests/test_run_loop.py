@@ -15,7 +15,6 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.outcomes import UNKNOWN
 from edge_runtime.util import UserError
 from trainer.evaluation import BEST_FILE, CHECKPOINT_FILE
 from trainer.learner.config import LearnerConfig
@@ -117,18 +116,23 @@ def test_a_budget_in_steps_ends_the_run_with_the_episode_under_way(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("outcome", "searched"),
+    ("outcomes", "searched"),
     [
-        ("collision", [True, False] * 2),
-        ("goal", [True] + [False] * 3),
-        (UNKNOWN, [True] + [False] * 3),
+        ("collision collision collision collision", [True, False, True, False]),
+        ("goal goal collision collision", [True, False, False, False]),
+        ("goal collision goal collision", [True, False, True, False]),
+        ("collision ended collision collision", [True, False, True, False]),
+        ("ended ended ended ended", [True, False, False, False]),
     ],
 )
-def test_every_other_episode_searches_until_the_rest_succeed(tmp_path, outcome, searched):
-    run = trained(tmp_path, 60, outcome, episodes=4, exploration_searching=4.0)
-    assert [told.exploration_std for told in run.told] == [4.0 * each for each in searched]
-    for episode, is_searching in zip(np.reshape(run.env.actions, (4, 60)), searched, strict=True):
-        assert {-1.0, 1.0} < {*episode} if is_searching else {*episode} == {POLICY}
+def test_every_other_episode_searches_until_one_of_the_rest_succeeds(tmp_path, outcomes, searched):
+    learner = replace(CONFIG.learner, exploration_searching=4.0)
+    run = scripted_run(tmp_path, replace(CONFIG, learner=learner), length=60)
+    for outcome, is_searching in zip(outcomes.split(), searched, strict=True):
+        run.env.outcome = outcome
+        assert run.advance().exploration_std == 4.0 * is_searching
+        driven = {*run.env.actions[-60:]}
+        assert {-1.0, 1.0} < driven if is_searching else driven == {POLICY}
 
 
 def bad_update(run):

@@ -229,7 +229,10 @@ class TrainingRun:
         """Episodes driven, and environment steps in those that a person has not discarded."""
         self.quitting = False  # End ``train`` after the episode under way
         self.has_succeeded = False
-        """Whether an episode without search or half of a validation has, or success is unknown."""
+        """Whether an episode without search or half of a validation has succeeded.
+
+        Also True if the first episode did not tell.
+        """
         self._shown_steps = 0  # Human steps in demonstrations; the first episode's row counts them
         if resume:
             path = run_dir / CHECKPOINT_FILE
@@ -259,7 +262,7 @@ class TrainingRun:
                 at_end = self.over or self.guide.stop or time.monotonic() > deadline_s
                 due = self._due(before)
                 self.validation.after(metrics, self.episode, due, at_end)
-                self.has_succeeded |= due and metrics.validation_success >= 0.5
+                self.has_succeeded |= metrics.validation_success >= 0.5
                 metrics_writer.add(metrics)
                 ending = at_end or self.quitting  # Read once: a signal may change it.
                 if ending or self.episode % self.config.checkpoint_every == 0:
@@ -278,7 +281,8 @@ class TrainingRun:
         metrics = self._episode()
         self.learning.check_weights()
         succeeded = metrics.outcome == GOAL and not self._searching
-        self.has_succeeded |= succeeded or not is_told([metrics.outcome])
+        untold = self.episode == 0 and not is_told([metrics.outcome])
+        self.has_succeeded |= succeeded or untold
         self.episode += 1
         self.steps = metrics.total_steps
         return metrics
@@ -407,7 +411,7 @@ class TrainingRun:
 
     @property
     def _searching(self) -> bool:
-        """Whether this episode searches: every other one does, until the others succeed."""
+        """Whether this episode searches: every other one does, until ``has_succeeded``."""
         searches = bool(self.config.learner.exploration_searching)
         return searches and not self.has_succeeded and self.episode % 2 == 0
 
