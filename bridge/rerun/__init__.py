@@ -61,7 +61,7 @@ START_S = 30.0  # Limit until a viewer listens
 LOOK_S = 0.05
 WRITE_S = 60.0  # Limit until a file is written
 FLUSH_S = 5.0  # Limit until a viewer has received everything
-END_S = 1.0  # Limit until a viewer that receives no more has ended
+END_S = 3.0  # Limit until a viewer that receives no more has ended
 FOXGLOVE_PORT = 8765  # Foxglove tries this port first
 SPAWN, SERVE, SUFFIX = "spawn", "serve", ".rrd"
 
