@@ -154,7 +154,7 @@ def check_foresight(env: Any) -> None:
         foreseen = foresee(driven, observation, action, steps)
         seen = [observation, *(driven.step(action)[0] for _ in foreseen[1:])]
     except Exception as error:  # An environment's own code may raise anything.
-        raise UserError(f"{env.scenario} cannot be copied to look ahead: {error!r}") from error
+        raise UserError(f"{env.scenario} cannot be copied to look ahead: {error}") from error
     if any(one.tobytes() != other.tobytes() for one, other in zip(seen, foreseen, strict=True)):
         raise UserError(f"{env.scenario} cannot be copied to look ahead: a copy drives differently")
 
