@@ -99,7 +99,7 @@ class Brief(gymnasium.Env):
 
     observation_space = Box(0, 255, (4, 4, 1), np.uint8)
     action_space = Box(-1.0, 1.0, (1,), np.float32)
-    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+    metadata = Rover.metadata
     most = 0.9
 
     def __init__(self, render_mode=None):

@@ -228,11 +228,8 @@ class TrainingRun:
         self.episode = self.steps = 0
         """Episodes driven, and environment steps in those that a person has not discarded."""
         self.quitting = False  # End ``train`` after the episode under way
-        self.has_succeeded = False
-        """Whether an episode without search or half of a validation has succeeded.
-
-        Also True if the first episode did not tell.
-        """
+        self.search_is_over = False
+        """An episode without search or half a validation succeeded, or the first did not tell."""
         self._shown_steps = 0  # Human steps in demonstrations; the first episode's row counts them
         if resume:
             path = run_dir / CHECKPOINT_FILE
@@ -260,9 +257,8 @@ class TrainingRun:
                 before = self.steps
                 metrics = self.advance()
                 at_end = self.over or self.guide.stop or time.monotonic() > deadline_s
-                due = self._due(before)
-                self.validation.after(metrics, self.episode, due, at_end)
-                self.has_succeeded |= metrics.validation_success >= 0.5
+                self.validation.after(metrics, self.episode, self._due(before), at_end)
+                self.search_is_over |= metrics.validation_success >= 0.5
                 metrics_writer.add(metrics)
                 ending = at_end or self.quitting  # Read once: a signal may change it.
                 if ending or self.episode % self.config.checkpoint_every == 0:
@@ -282,7 +278,7 @@ class TrainingRun:
         self.learning.check_weights()
         succeeded = metrics.outcome == GOAL and not self._searching
         untold = self.episode == 0 and not is_told([metrics.outcome])
-        self.has_succeeded |= succeeded or untold
+        self.search_is_over |= succeeded or untold
         self.episode += 1
         self.steps = metrics.total_steps
         return metrics
@@ -306,7 +302,7 @@ class TrainingRun:
             "steps": self.steps,
             "kept_actor": self.config.kept_actor,
             "exploration": self.exploration.bit_generator.state,
-            "found": self.has_succeeded,
+            "found": self.search_is_over,
             **self.validation.state_dict(),
         }
         util.save_torch(self.run_dir / CHECKPOINT_FILE, state)
@@ -316,7 +312,7 @@ class TrainingRun:
         self.episode, self.steps, _ = msgspec.convert(counts, list[Annotated[int, Meta(ge=0)]])
         self.learning.load_state_dict(state["learning"])
         self.exploration.bit_generator.state = state["exploration"]
-        self.has_succeeded = state["found"]
+        self.search_is_over = state["found"]
         self.guide.load_state_dict(state)
         self.validation.load_state_dict(state)
 
@@ -411,9 +407,9 @@ class TrainingRun:
 
     @property
     def _searching(self) -> bool:
-        """Whether this episode searches: every other one does, until ``has_succeeded``."""
+        """Whether this episode searches: every other one does, until ``search_is_over``."""
         searches = bool(self.config.learner.exploration_searching)
-        return searches and not self.has_succeeded and self.episode % 2 == 0
+        return searches and not self.search_is_over and self.episode % 2 == 0
 
     def _exploration_std(self) -> float:
         c = self.config.learner
