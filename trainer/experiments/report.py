@@ -37,6 +37,8 @@ SCENES = [*product(plan.SCENARIOS, CONDITIONS)]
 PAPER_SCENES = [scene for scene in SCENES if scene[1] != "dense"]
 BESIDE = [Line(row, plan.GOOD) for row in plan.ROWS]
 """The rows of the table of human guidance, beside the scripted expert."""
+UPDATE_SETTINGS = "one_update", "four_updates", "sixteen_updates"
+MORE_UPDATES = [Line("phil_td3", setting) for setting in UPDATE_SETTINGS]
 OWN = {"model": Line("human_model", "model"), "slower": Line("expert", "slower")}
 """Humans with a policy of their own; all others are the expert, with or without a fault."""
 
