@@ -29,7 +29,7 @@ from trainer.learner.config import ALGORITHMS
 from trainer.training.config import PRESETS, flat
 
 Cell = Callable[[pd.DataFrame], str]
-PHIL = "phil_td3"
+PHIL = Line("phil_td3", plan.GOOD)
 PAIRS = len(plan.SCENARIOS) * plan.DEFAULT_SEEDS
 ENOUGH = 9  # Pairs to win; an equally good row wins so many by chance in one of 93 cases
 MOST_EPISODES = 100  # A row of the table of human guidance should learn within these
@@ -38,7 +38,7 @@ PAPER_SCENES = [scene for scene in SCENES if scene[1] != "dense"]
 BESIDE = [Line(row, plan.GOOD) for row in plan.ROWS]
 """The rows of the table of human guidance, beside the scripted expert."""
 UPDATE_SETTINGS = "one_update", "four_updates", "sixteen_updates"
-MORE_UPDATES = [Line("phil_td3", setting) for setting in UPDATE_SETTINGS]
+ONE, *MORE = MORE_UPDATES = [PHIL._replace(setting=each) for each in UPDATE_SETTINGS]
 OWN = {"model": Line("human_model", "model"), "slower": Line("expert", "slower")}
 """Humans with a policy of their own; all others are the expert, with or without a fault."""
 
@@ -217,17 +217,25 @@ def cost(records: Records) -> str:
 # The fair table of human guidance
 
 
-def pairs(records: Records, row: str, tasks: Iterable[str] = plan.SCENARIOS) -> pd.DataFrame:
-    """Return the human seconds until a row and PHIL-TD3 had learned, one pair a task and seed."""
-    units = records.numbers[records.numbers.seed <= plan.DEFAULT_SEEDS]
-    units = units[units.scenario.isin([*tasks]) & (units.setting == plan.GOOD)]
-    learned = units.pivot(index=["scenario", "seed"], columns="algorithm", values=S_LEARNED)
-    return learned.reindex(columns=[row, PHIL]).dropna().set_axis(["own", "phil"], axis=1)
+def pairs(
+    records: Records,
+    own: Line,
+    tasks: Iterable[str] = plan.SCENARIOS,
+    other: Line = PHIL,
+) -> pd.DataFrame:
+    """Return the human seconds until two lines had learned, one pair a task and seed."""
+
+    def learned(line: Line) -> pd.Series:
+        units = pd.concat([records.of(task, line) for task in tasks])
+        units = units[units.seed <= plan.DEFAULT_SEEDS]
+        return units.set_index(["scenario", "seed"])[S_LEARNED]
+
+    return pd.concat({"own": learned(own), "other": learned(other)}, axis=1).dropna()
 
 
 def less_in(found: pd.DataFrame) -> str:
-    """Return in how many pairs a row needs fewer human seconds than PHIL-TD3."""
-    return f"{(found.own < found.phil).sum()} of {len(found)}"
+    """Return in how many pairs a line needs fewer human seconds than the other."""
+    return f"{(found.own < found.other).sum()} of {len(found)}"
 
 
 def over(records: Records, rows: pd.DataFrame, other: Line, column: str) -> Estimate:
@@ -238,14 +246,14 @@ def over(records: Records, rows: pd.DataFrame, other: Line, column: str) -> Esti
 
 def beside_phil(records: Records) -> Mapping[str, Cell]:
     def points(rows: pd.DataFrame) -> str:
-        return over(records, rows, Line(PHIL, plan.GOOD), "success nominal").times(100.0).text(1)
+        return over(records, rows, PHIL, "success nominal").times(100.0).text(1)
 
     def pairs_of(rows: pd.DataFrame) -> pd.DataFrame:
-        return pairs(records, rows.algorithm.iloc[0], [rows.scenario.iloc[0]])
+        return pairs(records, Line(rows.algorithm.iloc[0], plan.GOOD), [rows.scenario.iloc[0]])
 
     def sooner(rows: pd.DataFrame) -> str:
         both = pairs_of(rows)
-        less = (both.own - both.phil).where(both.own != both.phil, 0.0)
+        less = (both.own - both.other).where(both.own != both.other, 0.0)
         return spread(less) if np.isfinite(both).any(axis=None) else "–"
 
     return {"success, nominal, points": points, S_TO_LEARNED: sooner,
@@ -257,19 +265,19 @@ def default(records: Records) -> str | int:
 
     While pairs are missing, return instead the number of pairs of the row with the fewest.
     """
-    pairs_of = {row: pairs(records, row) for row in plan.RIVALS}
+    pairs_of = {row: pairs(records, Line(row, plan.GOOD)) for row in plan.RIVALS}
     if (fewest := min(map(len, pairs_of.values()))) < PAIRS:
         return fewest
 
     def takes_its_place(row: str) -> bool:
-        behind = (over(records, records.of(scenario, Line(row, plan.GOOD)), Line(PHIL, plan.GOOD),
+        behind = (over(records, records.of(scenario, Line(row, plan.GOOD)), PHIL,
                        f"success {condition}").high < 0.0
                   for scenario, condition in PAPER_SCENES)  # fmt: skip
-        return (pairs_of[row].own < pairs_of[row].phil).sum() >= ENOUGH and not any(behind)
+        return (pairs_of[row].own < pairs_of[row].other).sum() >= ENOUGH and not any(behind)
 
     better = {row: pairs_of[row].own.quantile(interpolation="higher")
               for row in filter(takes_its_place, plan.RIVALS)}  # fmt: skip
-    return Line(min(better, key=better.__getitem__, default=PHIL)).name
+    return Line(min(better, key=better.__getitem__, default=PHIL.algorithm)).name
 
 
 def late(records: Records) -> list[str]:
@@ -390,7 +398,7 @@ def draw_guidance(records: Records) -> Figure:
     heights = dict(zip(plan.ROWS, -np.arange(len(plan.ROWS)), strict=True))
 
     def dots(panel: Axes, row: str, values: Any, middle: float) -> None:
-        height, colour = heights[row], "C3" if row == "phil_td3" else "C0"
+        height, colour = heights[row], "C3" if row == PHIL.algorithm else "C0"
         places = height + np.linspace(0.2, -0.2, len(values))
         panel.plot(values, places, "o", ms=4, alpha=0.55, mew=0, color=colour)
         panel.plot([middle] * 2, [height - 0.35, height + 0.35], lw=2, color=colour)
