@@ -218,10 +218,7 @@ def cost(records: Records) -> str:
 
 
 def pairs(
-    records: Records,
-    own: Line,
-    tasks: Iterable[str] = plan.SCENARIOS,
-    other: Line = PHIL,
+    records: Records, own: Line, tasks: Iterable[str] = plan.SCENARIOS, other: Line = PHIL
 ) -> pd.DataFrame:
     """Return the human seconds until two lines had learned, one pair a task and seed."""
 
