@@ -37,8 +37,9 @@ SCENES = [*product(plan.SCENARIOS, CONDITIONS)]
 PAPER_SCENES = [scene for scene in SCENES if scene[1] != "dense"]
 BESIDE = [Line(row, plan.GOOD) for row in plan.ROWS]
 """The rows of the table of human guidance, beside the scripted expert."""
-UPDATE_SETTINGS = "one_update", "four_updates", "sixteen_updates"
-ONE, *MORE = MORE_UPDATES = [PHIL._replace(setting=each) for each in UPDATE_SETTINGS]
+ONE_UPDATE, *MORE_UPDATES = UPDATES_A_STEP = [
+    PHIL._replace(setting=each) for each in ("one_update", "four_updates", "sixteen_updates")
+]
 OWN = {"model": Line("human_model", "model"), "slower": Line("expert", "slower")}
 """Humans with a policy of their own; all others are the expert, with or without a fault."""
 
@@ -262,19 +263,18 @@ def default(records: Records) -> str | int:
 
     While pairs are missing, return instead the number of pairs of the row with the fewest.
     """
-    pairs_of = {row: pairs(records, Line(row, plan.GOOD)) for row in plan.RIVALS}
+    pairs_of = {line: pairs(records, line) for line in BESIDE if line.algorithm in plan.RIVALS}
     if (fewest := min(map(len, pairs_of.values()))) < PAIRS:
         return fewest
 
-    def takes_its_place(row: str) -> bool:
-        behind = (over(records, records.of(scenario, Line(row, plan.GOOD)), PHIL,
-                       f"success {condition}").high < 0.0
+    def takes_its_place(line: Line) -> bool:
+        behind = (over(records, records.of(scenario, line), PHIL, f"success {condition}").high < 0.0
                   for scenario, condition in PAPER_SCENES)  # fmt: skip
-        return (pairs_of[row].own < pairs_of[row].other).sum() >= ENOUGH and not any(behind)
+        return (pairs_of[line].own < pairs_of[line].other).sum() >= ENOUGH and not any(behind)
 
-    better = {row: pairs_of[row].own.quantile(interpolation="higher")
-              for row in filter(takes_its_place, plan.RIVALS)}  # fmt: skip
-    return Line(min(better, key=better.__getitem__, default=PHIL.algorithm)).name
+    better = {line: pairs_of[line].own.quantile(interpolation="higher")
+              for line in filter(takes_its_place, pairs_of)}  # fmt: skip
+    return min(better, key=better.__getitem__, default=PHIL).name
 
 
 def late(records: Records) -> list[str]:
