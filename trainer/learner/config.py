@@ -253,6 +253,8 @@ class LearnerConfig:
     """How often in a run, evenly spaced, the actor is replaced by a fresh one fitted to all human
     actions so far. An actor that began with few of them generalises worse (Ash and Adams, 2020).
     Default without pictures: 3."""
+    fresh_actor_at_end: bool = False
+    """One more fresh actor when the run ends. Default without pictures where a row only imitates."""
     preference_beta: float = 0.1
     """Sharpness of a preference, per squared distance (2510.01545: beta); with a low value the loss
     keeps pulling when the actor is already nearer to the preferred action."""
@@ -328,6 +330,8 @@ def task_settings(row: Algorithm, numbers: bool, period_s: float) -> dict[str, f
     if not numbers:
         return lasting
     imitated = IMITATED_NUMBERS if row.behaviour_cloning else {}
+    if row.behaviour_cloning and not (row.q_term or row.foresight):
+        imitated = {**imitated, "fresh_actor_at_end": True}
     return lasting | imitated | ({} if row.guided else UNGUIDED_NUMBERS)
 
 

@@ -182,9 +182,17 @@ class LearningThread:
         due = min(int(progress * (times + 1)), times)
         if due > self._renewed and self.replay.human_count:
             self._renewed = due
-            batches = (self.replay.show(FRESH_BATCH_SIZE, self._random) for _ in count())
-            self.in_thread(self.learner.begin_actor_anew, batches)
-            self._refresh_actor()
+            self._fit_fresh_actor()
+
+    def end_run(self) -> None:
+        """Fit a last fresh actor, if the settings ask for it."""
+        if self.config.fresh_actor_at_end and self.replay.human_count:
+            self._fit_fresh_actor()
+
+    def _fit_fresh_actor(self) -> None:
+        batches = (self.replay.show(FRESH_BATCH_SIZE, self._random) for _ in count())
+        self.in_thread(self.learner.begin_actor_anew, batches)
+        self._refresh_actor()
 
     def release(self, keep: bool = True) -> None:
         """End the episode; `UnhurriedLearning` stores its steps now, if ``keep``."""

@@ -281,6 +281,8 @@ class TrainingRun:
         self.search_is_over |= succeeded or untold
         self.episode += 1
         self.steps = metrics.total_steps
+        if self.over:
+            self.learning.end_run()
         return metrics
 
     @property
