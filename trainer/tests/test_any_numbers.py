@@ -18,6 +18,7 @@ from trainer.learner.td3 import NETWORKS, TD3Learner
 from trainer.tests.learners import SMALL, make_batch
 from trainer.training.config import make_config
 from trainer.training.learning import LearningThread
+from trainer.training.run import NOBODY, TrainingRun
 
 WIDE = Box(np.array([-100, -1, 0, -np.inf], "f4"), np.array([100, 1, 10, np.inf], "f4"))
 SEEN = np.array([[40.0, 0.5, 3.0, 7.0], [42.0, 0.501, 3.0, 9.0]], np.float32)
@@ -118,6 +119,24 @@ def test_the_actor_begins_anew_at_even_parts_of_a_run(algorithm, monkeypatch):
         assert len(begun) == (2 if algorithm == "phil_td3" else 0)
         learning.close()
         resumed.close()
+
+
+@pytest.mark.parametrize("algorithm", ["cloning_only", "ppl_td3", "phil_td3", "hi_td3"])
+def test_a_row_that_only_imitates_ends_with_a_fresh_actor(algorithm, tmp_path, monkeypatch):
+    """Even where none began within the run."""
+    env = make_environment("Pendulum-v1")
+    with closing(env):
+        unlearned = {**SETTINGS, "warmup_steps": 1000, "fresh_actors": 0, "episodes": 2}
+        config = make_config("ours", {**unlearned, "algorithm": algorithm}, env)
+        run = TrainingRun(config, tmp_path, env=env, guide=NOBODY)
+        begun: list[int] = []
+        learner = run.learning.learner
+        monkeypatch.setattr(learner, "begin_actor_anew", lambda _: begun.append(run.episode))
+        seen = np.zeros((1, 3), np.float32)
+        run.learning.add(Transition(seen, np.zeros(1, np.float32), 0.0, seen, False, human=True))
+        run.learning.release()
+        run.train()
+        assert begun == ([2] if algorithm == "cloning_only" else [])
 
 
 def test_a_fitted_actor_acts_on_what_it_has_seen():
