@@ -254,7 +254,7 @@ class LearnerConfig:
     actions so far. An actor that began with few of them generalises worse (Ash and Adams, 2020).
     Default without pictures: 3."""
     fresh_actor_at_end: bool = False
-    """One more fresh actor when the run ends. Default without pictures where a row only imitates."""
+    """One more when the run ends. Default without pictures where a row only imitates: true."""
     preference_beta: float = 0.1
     """Sharpness of a preference, per squared distance (2510.01545: beta); with a low value the loss
     keeps pulling when the actor is already nearer to the preferred action."""
