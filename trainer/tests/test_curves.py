@@ -24,7 +24,9 @@ def good(observation: Any, info: Any, total_return: float) -> bool | None:
     return total_return > -1e9
 
 
-def run_of(directory: Path, algorithm: str, episodes: int, returns: float, known: bool) -> Path:
+def run_of(
+    directory: Path, algorithm: str, episodes: int, returns: float, known: bool, **settings: Any
+) -> Path:
     writer = MetricsWriter(directory)
     for episode in range(episodes):
         due = episode % 5 == 4
@@ -36,7 +38,7 @@ def run_of(directory: Path, algorithm: str, episodes: int, returns: float, known
             )
         )  # fmt: skip
     writer.close()
-    (directory / "config.json").write_text(json.dumps({"algorithm": algorithm}))
+    (directory / "config.json").write_text(json.dumps({"algorithm": algorithm, **settings}))
     return directory
 
 
@@ -63,6 +65,19 @@ def test_each_algorithm_is_a_line_named_with_a_band_up_to_the_shortest_run(tmp_p
     assert several.get_ydata() == pytest.approx(np.full(curves.POINTS, 2.0))
     assert len(panel.collections) == 1
     assert set(alone.get_ydata()) == {5.0}
+
+
+def test_settings_that_differ_part_an_algorithms_runs_and_name_them(tmp_path, drawn):
+    """Not the seed, nor another algorithm's settings."""
+    runs = [("phil_td3", 1, 40.0), ("phil_td3", 2, 40.0), ("phil_td3", 1, 10.0), ("hi_td3", 1, 5.0)]
+    for number, (algorithm, seed, weight) in enumerate(runs):
+        settings = {"seed": seed, "learner": {"cloning_weight": weight}, "source_revision": number}
+        run_of(tmp_path / str(number), algorithm, 20, 1.0, True, **settings)
+    curves.write_learning_curve(tmp_path, out="f.png")
+    labels = [line.get_label() for line in drawn[0].axes[0].get_lines()]
+    assert labels == [
+        "phil_td3, cloning_weight=40.0, 2 runs", "phil_td3, cloning_weight=10.0", "hi_td3",
+    ]  # fmt: skip
 
 
 def test_seeds_are_trained_in_processes_of_their_own_and_drawn(tmp_path, capsys):

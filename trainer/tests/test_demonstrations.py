@@ -15,11 +15,12 @@ from hil_tests.tests.shared.commands import refusal
 from hil_tests.tests.shared.messages import make_feedback
 from trainer.environments import make_environment, task_of
 from trainer.learner.config import LearnerConfig
+from trainer.person import PERSON
 from trainer.person.tests.people import record, recorded_step
 from trainer.training.config import RunConfig
 from trainer.training.demonstrations import read_demonstrations
 from trainer.training.metrics import read_metrics
-from trainer.training.run import TrainingRun
+from trainer.training.run import NOBODY, UNPAID, TrainingRun
 
 DRIVE = Path(__file__).parents[2] / "hil_tests/recordings/left_turn.mcap"
 
@@ -108,6 +109,22 @@ def test_a_drive_by_hand_is_taken_as_recorded_from_the_first_movement_to_the_las
     assert pedals == pytest.approx([0.05, 0.06, 0.07, 0.08, 0.09, 0.10])
     assert all(step.human and step.reward == 0.0 for step in episode)
     assert [step.truncated for step in episode] == [False] * 5 + [True]
+
+
+@pytest.mark.parametrize("algorithm", ["phil_td3", "cloning_only"])
+def test_drives_without_rewards_are_said_where_they_mislead(algorithm, tmp_path, capsys):
+    path = hand_driven(tmp_path / "drive.mcap", [0.3] * 4)
+    config = RunConfig(algorithm=algorithm, demonstrations=str(path))
+    TrainingRun(config, tmp_path / "run").learning.close()
+    assert (UNPAID in capsys.readouterr().err) == (algorithm == "phil_td3")
+
+
+def test_beside_a_person_the_expert_shows(tmp_path, capsys):
+    config = RunConfig(human=PERSON, demonstrations="human:1")
+    run = TrainingRun(config, tmp_path / "run", guide=NOBODY)
+    assert run.learning.replay.human_count > 30
+    assert not capsys.readouterr().err
+    run.learning.close()
 
 
 def test_what_the_runtime_drove_is_not_the_persons(tmp_path):

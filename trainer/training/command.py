@@ -90,6 +90,7 @@ def _run_seeds(arguments: argparse.Namespace) -> Iterator[bool]:
     pool = ProcessPoolExecutor(
         util.cores(), get_context("spawn"), util.begin_process, (0,), max_tasks_per_child=1
     )
+    said: set[str] = set()
     with pool, ProgressBar("seeds", len(jobs)) as bar:
         work = [pool.submit(_run_quietly, job) for job in jobs]
 
@@ -102,17 +103,21 @@ def _run_seeds(arguments: argparse.Namespace) -> Iterator[bool]:
 
         with quit_on_signals(quit_all):
             for each in as_completed(work):
-                printed, interrupted = ("", True) if each.cancelled() else each.result()
+                printed, warned, interrupted = ("", "", True) if each.cancelled() else each.result()
                 bar.advance({})
+                news = [line for line in warned.splitlines() if line not in said]
+                print("".join(f"{line}\n" for line in news), end="", file=sys.stderr)
+                said.update(news)
                 print(printed, end="")
                 yield interrupted
 
 
-def _run_quietly(arguments: argparse.Namespace) -> tuple[str, bool]:
-    """Return what a run prints at its end, and whether it was interrupted."""
-    with redirect_stdout(io.StringIO()) as printed, redirect_stderr(io.StringIO()):
+def _run_quietly(arguments: argparse.Namespace) -> tuple[str, str, bool]:
+    """Return what a run prints at its end, its warnings, and whether it was interrupted."""
+    with redirect_stdout(io.StringIO()) as printed, redirect_stderr(io.StringIO()) as said:
         interrupted = _run(arguments).interrupted
-    return printed.getvalue(), interrupted
+    lines = (line for line in said.getvalue().splitlines() if line and "training: " not in line)
+    return printed.getvalue(), "\n".join(lines), interrupted
 
 
 def _run(arguments: argparse.Namespace) -> Run:

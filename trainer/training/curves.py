@@ -1,7 +1,7 @@
-"""``python -m trainer plot``: learning curves of runs, a line and a band for each algorithm."""
+"""``python -m trainer plot``: learning curves of runs, a line and a band for all seeds of one."""
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +12,11 @@ from matplotlib.figure import Figure
 from bridge.outcomes import mean_estimate
 from bridge.report import write_figure
 from edge_runtime.util import UserError, read_json
-from trainer.training.config import CONFIG_FILE, CURVE_FILE
+from trainer.training.config import CONFIG_FILE, CURVE_FILE, EXTENT, settings_in
 from trainer.training.metrics import METRICS_FILE, metrics_table
 
 WINDOW = 20  # Episodes of the moving average
+NOT_COMPARED = {"seed", "device", "threads", "checkpoint_every", *EXTENT}  # Settings
 POINTS = 100  # At which the runs of an algorithm are averaged
 AXES = {"steps": "environment steps", "human_s": "seconds driven by the human"}
 """Columns that curves are drawn over, the words of ``--x``: ``total_steps`` and so on."""
@@ -40,14 +41,15 @@ def run(arguments: argparse.Namespace) -> int:
 def write_learning_curve(*dirs: Path, out: str | None = None, x: str = "steps") -> Path:
     """Draw return, surviving distance, validation and the human's share as a PNG.
 
-    Runs of one algorithm become one line, their mean with its 95 % interval, up to the end of the
-    shortest. A directory is a run, or holds runs. If success is unknown, the validation's return is
-    drawn instead. ``out`` defaults to a file in the first directory. UserError: a run has no
-    metrics yet.
+    Runs that differ in the seed alone become one line, their mean with its 95 % interval, up to the
+    end of the shortest. A directory is a run, or holds runs. If success is unknown, the
+    validation's return is drawn instead. ``out`` defaults to a file in the first directory.
+    UserError: a run has no metrics yet.
     """
+    run_dirs = [run_dir for directory in dirs for run_dir in _runs_in(directory)]
     groups: dict[str, list[pd.DataFrame]] = {}
-    for run_dir in (run_dir for directory in dirs for run_dir in _runs_in(directory)):
-        groups.setdefault(_name(run_dir), []).append(_curves(run_dir))
+    for run_dir, label in zip(run_dirs, _labels(run_dirs), strict=True):
+        groups.setdefault(label, []).append(_curves(run_dir))
     runs = [run for group in groups.values() for run in group]
     left_out = RETURN if any(run[SUCCESS].notna().any() for run in runs) else SUCCESS
     figure = Figure(figsize=(10, 6), layout="constrained")
@@ -70,9 +72,22 @@ def _runs_in(directory: Path) -> Sequence[Path]:
     return sorted(path.parent for path in directory.glob(f"*/{METRICS_FILE}")) or [directory]
 
 
-def _name(run_dir: Path) -> str:
+def _labels(run_dirs: Sequence[Path]) -> Iterator[str]:
+    """Yield each run's algorithm, with the settings in which the runs of this algorithm differ."""
+    configs = list(map(_settings, run_dirs))
+    for config in configs:
+        alike = [each for each in configs if each["algorithm"] == config["algorithm"]]
+        differing = [
+            f"{name}={value}" for name, value in config.items()
+            if name not in NOT_COMPARED and any(each.get(name) != value for each in alike)
+        ]  # fmt: skip
+        yield ", ".join([config["algorithm"], *differing])
+
+
+def _settings(run_dir: Path) -> dict[str, Any]:
     path = run_dir / CONFIG_FILE
-    return str(read_json(path, "run config")["algorithm"]) if path.exists() else run_dir.name
+    saved = settings_in(read_json(path, "run config"), str(path)) if path.exists() else {}
+    return {"algorithm": run_dir.name, **saved}
 
 
 def _curves(run_dir: Path) -> pd.DataFrame:

@@ -33,7 +33,7 @@ from trainer.util import Purpose, episode_seed
 Episode = list[Transition]
 REWARD = "next.reward"  # Column of a data set; ours have none
 SCRIPTED = re.compile(r"human:(\d+)")
-"""Instead of a path: N drives of the run's own human, a script or a model."""
+"""Instead of a path: N drives of the run's scripted human, or of the expert beside a person."""
 
 
 def read_demonstrations(place: Path, env: Any) -> Iterator[Episode]:

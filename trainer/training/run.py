@@ -2,6 +2,7 @@
 
 import copy
 import math
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
@@ -38,6 +39,7 @@ from trainer.learner import equations
 from trainer.learner.config import find_algorithm
 from trainer.learner.networks import Actor
 from trainer.learner.replay import Action, Observation, Transition
+from trainer.person import PERSON
 from trainer.scenarios import SCENARIOS
 from trainer.training.config import CONFIG_FILE, RANDOM, TAKEOVERS, RunConfig
 from trainer.training.demonstrations import (
@@ -166,6 +168,7 @@ class Validation(Trials):
 
 
 NOBODY = Guide()
+UNPAID = "holds no rewards: each of its steps counts as 0 (cloning_only needs none)"
 
 
 def make_guide(config: RunConfig, env: Any) -> Guide:
@@ -191,8 +194,9 @@ def make_guide(config: RunConfig, env: Any) -> Guide:
 
 def demonstrations_of(config: RunConfig, env: Any) -> Iterator[Episode]:
     """Yield the episodes that fill a run's replay before its first step."""
+    by_person = config.human == PERSON
     if scripted := SCRIPTED.fullmatch(config.demonstrations):
-        driver, _ = evaluation.load_driver(config.human, env)
+        driver, _ = evaluation.load_driver("expert" if by_person else config.human, env)
         return drive_demonstrations(driver, env, config.seed, int(scripted[1]))
     return read_demonstrations(Path(config.demonstrations), env)
 
@@ -236,11 +240,15 @@ class TrainingRun:
             with util.fitting(f"{path} does not fit this run"):
                 self._restore(util.load_torch(path))
         elif config.demonstrations:
+            paid = False
             for episode in demonstrations_of(config, self.env):
                 for transition in episode:
                     self.learning.add(transition)
                     self._shown_steps += transition.human
+                    paid |= transition.reward != 0.0
                 self.learning.release()
+            if not paid and self.algorithm.rewarded and self.algorithm.q_term:
+                print(f"{config.demonstrations} {UNPAID}", file=sys.stderr)
 
     def train(
         self,
