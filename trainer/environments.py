@@ -189,7 +189,8 @@ class Adapted(bridge.Adapter):
     """Gives any environment the interface of our two scenarios.
 
     ``name`` is the name it was made by; ``judge`` decides at an episode's end whether it
-    succeeded. Raises UserError for spaces that `bridge.environments.describe` refuses.
+    succeeded, where the environment says nothing. Raises UserError for spaces that
+    `bridge.environments.describe` refuses.
     """
 
     goal_m = float("nan")
@@ -239,10 +240,20 @@ class Adapted(bridge.Adapter):
         info, reward = _completed(info), bridge.finite("reward", reward)
         self._return += reward
         if terminated or truncated:
-            if self.judge:
-                info["is_success"] = self.judge(observation, info, self._return)
+            if self.judge and not info.get("outcome") and info.get("is_success") is None:
+                info["is_success"] = self._judged(observation, info)
             info["outcome"] = outcome_of(info, only_truncated=not terminated)
         return self._as_array(observation), reward, bool(terminated), bool(truncated), info
+
+    def _judged(self, observation: Any, info: Mapping[str, Any]) -> bool | None:
+        assert self.judge
+        try:
+            said = self.judge(observation, info, self._return)
+        except (Exception, SystemExit) as error:  # It may raise anything.
+            raise UserError(f"--success failed: {type(error).__name__}: {error}") from error
+        if said is None or isinstance(said, bool | np.bool_):
+            return said
+        raise UserError(f"--success must return True, False or None, not {type(said).__name__}")
 
     def close(self) -> None:
         """Close the environment: some simulators allow only one in a process."""

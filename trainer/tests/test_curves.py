@@ -2,6 +2,7 @@
 
 import json
 import math
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,10 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
+from edge_runtime.util import UserError
 from hil_tests.tests.shared.commands import call, refusal
 from trainer.__main__ import seeds
+from trainer.environments import make_environment
 from trainer.training import curves
 from trainer.training.metrics import EpisodeMetrics, MetricsWriter, read_metrics
 
@@ -101,3 +104,30 @@ def test_seeds_are_trained_in_processes_of_their_own_and_drawn(tmp_path, capsys)
 def test_a_scenario_takes_no_other_judge(tmp_path, capsys):
     options = ("train", "--success", f"{__name__}:good", "--out", tmp_path / "run")
     assert "itself says" in refusal(capsys, *options)
+
+
+def fails(observation: Any, info: Any, total_return: float) -> bool:
+    raise RuntimeError("no judge today")
+
+
+def last_info(task: str) -> Any:
+    """The info at the end of an episode at rest, which ``fails`` judges."""
+    ended = False
+    with closing(make_environment(task, success=f"{__name__}:fails")) as env:
+        env.reset(seed=0)
+        while not ended:
+            _, _, terminated, truncated, info = env.step(env.rest_action)
+            ended = terminated or truncated
+    return info
+
+
+@pytest.mark.parametrize("judge", [fails, lambda *_: "no", lambda *_: math.nan, lambda: True, 5])
+def test_a_judge_that_does_not_answer_is_one_line(judge, monkeypatch):
+    monkeypatch.setitem(globals(), "fails", judge)
+    with pytest.raises(UserError, match="--success") as refused:
+        last_info("Pendulum-v1")
+    assert "\n" not in str(refused.value)
+
+
+def test_a_judge_is_not_asked_where_the_environment_says_it():
+    assert last_info("examples.tasks:examples/Hill-v0")["outcome"] == "failed"
