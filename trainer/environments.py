@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from bridge import environments as bridge
 from bridge.inbound import ROUNDING_S
 from bridge.network import COMMAND_WINDOW, LatencySpec, VirtualLink
-from bridge.outcomes import outcome_of
+from bridge.outcomes import UNKNOWN, outcome_of
 from edge_runtime.manifest import Task
 from edge_runtime.util import UserError, load_named
 from edge_runtime.wire import DRIVE, Command
@@ -185,6 +185,16 @@ def inner(action_range: tuple[Any, Any], action: Any) -> Action:
     return np.clip(2.0 * share - 1.0, -1.0, 1.0).astype(np.float32)
 
 
+def _asked(judge: Judge, *ending: Any) -> bool | None:
+    try:
+        said = judge(*ending)
+    except (Exception, SystemExit) as error:  # It may raise anything.
+        raise UserError(f"--success failed: {type(error).__name__}: {error}") from error
+    if said is None or isinstance(said, bool | np.bool_):
+        return said
+    raise UserError(f"--success must return True, False or None, not {type(said).__name__}")
+
+
 class Adapted(bridge.Adapter):
     """Gives any environment the interface of our two scenarios.
 
@@ -240,20 +250,10 @@ class Adapted(bridge.Adapter):
         info, reward = _completed(info), bridge.finite("reward", reward)
         self._return += reward
         if terminated or truncated:
-            if self.judge and not info.get("outcome") and info.get("is_success") is None:
-                info["is_success"] = self._judged(observation, info)
+            if self.judge and outcome_of(info) == UNKNOWN:
+                info["is_success"] = _asked(self.judge, observation, info, self._return)
             info["outcome"] = outcome_of(info, only_truncated=not terminated)
         return self._as_array(observation), reward, bool(terminated), bool(truncated), info
-
-    def _judged(self, observation: Any, info: Mapping[str, Any]) -> bool | None:
-        assert self.judge
-        try:
-            said = self.judge(observation, info, self._return)
-        except (Exception, SystemExit) as error:  # It may raise anything.
-            raise UserError(f"--success failed: {type(error).__name__}: {error}") from error
-        if said is None or isinstance(said, bool | np.bool_):
-            return said
-        raise UserError(f"--success must return True, False or None, not {type(said).__name__}")
 
     def close(self) -> None:
         """Close the environment: some simulators allow only one in a process."""

@@ -22,6 +22,7 @@ from typing import Any
 
 import pandas as pd
 
+from bridge.environments import say_once
 from bridge.outcomes import success_estimate, success_share
 from bridge.report import ProgressBar
 from edge_runtime.cli import INTERRUPTED, quit_on_signals
@@ -90,7 +91,6 @@ def _run_seeds(arguments: argparse.Namespace) -> Iterator[bool]:
     pool = ProcessPoolExecutor(
         util.cores(), get_context("spawn"), util.begin_process, (0,), max_tasks_per_child=1
     )
-    said: set[str] = set()
     with pool, ProgressBar("seeds", len(jobs)) as bar:
         work = [pool.submit(_run_quietly, job) for job in jobs]
 
@@ -103,21 +103,21 @@ def _run_seeds(arguments: argparse.Namespace) -> Iterator[bool]:
 
         with quit_on_signals(quit_all):
             for each in as_completed(work):
-                printed, warned, interrupted = ("", "", True) if each.cancelled() else each.result()
+                printed, warned, interrupted = ("", [], True) if each.cancelled() else each.result()
                 bar.advance({})
-                news = [line for line in warned.splitlines() if line not in said]
-                print("".join(f"{line}\n" for line in news), end="", file=sys.stderr)
-                said.update(news)
+                for line in warned:
+                    say_once(line)
                 print(printed, end="")
                 yield interrupted
 
 
-def _run_quietly(arguments: argparse.Namespace) -> tuple[str, str, bool]:
+def _run_quietly(arguments: argparse.Namespace) -> tuple[str, list[str], bool]:
     """Return what a run prints at its end, its warnings, and whether it was interrupted."""
     with redirect_stdout(io.StringIO()) as printed, redirect_stderr(io.StringIO()) as said:
         interrupted = _run(arguments).interrupted
-    lines = (line for line in said.getvalue().splitlines() if line and "training: " not in line)
-    return printed.getvalue(), "\n".join(lines), interrupted
+    lines = filter(None, said.getvalue().splitlines())
+    warned = [line for line in lines if not line.startswith("training: ")]
+    return printed.getvalue(), warned, interrupted
 
 
 def _run(arguments: argparse.Namespace) -> Run:

@@ -1,4 +1,4 @@
-"""``python -m trainer plot``: learning curves of runs, a line and a band for all seeds of one."""
+"""``python -m trainer plot``: learning curves of runs, a line and a band for each setting."""
 
 import argparse
 from collections.abc import Iterator, Sequence

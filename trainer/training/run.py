@@ -2,7 +2,6 @@
 
 import copy
 import math
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
@@ -14,7 +13,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from bridge.environments import finite
+from bridge.environments import finite, say_once
 from bridge.network import parse_spec
 from bridge.outcomes import DISCARDED, GOAL, is_told, success_share
 from bridge.report import EpisodeResult
@@ -194,9 +193,9 @@ def make_guide(config: RunConfig, env: Any) -> Guide:
 
 def demonstrations_of(config: RunConfig, env: Any) -> Iterator[Episode]:
     """Yield the episodes that fill a run's replay before its first step."""
-    by_person = config.human == PERSON
     if scripted := SCRIPTED.fullmatch(config.demonstrations):
-        driver, _ = evaluation.load_driver("expert" if by_person else config.human, env)
+        human = "expert" if config.human == PERSON else config.human
+        driver, _ = evaluation.load_driver(human, env)
         return drive_demonstrations(driver, env, config.seed, int(scripted[1]))
     return read_demonstrations(Path(config.demonstrations), env)
 
@@ -248,7 +247,7 @@ class TrainingRun:
                     paid |= transition.reward != 0.0
                 self.learning.release()
             if not paid and self.algorithm.rewarded and self.algorithm.q_term:
-                print(f"{config.demonstrations} {UNPAID}", file=sys.stderr)
+                say_once(f"{config.demonstrations} {UNPAID}")
 
     def train(
         self,
