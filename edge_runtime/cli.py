@@ -169,15 +169,17 @@ def _drop_stdout() -> None:
 def whole_number(least: int, most: int = _LARGEST) -> Callable[[str], int]:
     """Make an option type: a whole number between two limits, both included."""
     limits = f"a whole number from {least} to {most}"
-    return _within(int, limits, lambda value: least <= value <= most)
+    return within(int, limits, lambda value: least <= value <= most)
 
 
 def number(limits: str, fits: Callable[[float], bool]) -> Callable[[str], float]:
     """Make an option type: a finite number that ``fits``; ``limits`` says in words which do."""
-    return _within(float, limits, lambda value: math.isfinite(value) and fits(value))
+    return within(float, limits, lambda value: math.isfinite(value) and fits(value))
 
 
-def _within(kind: Any, limits: str, fits: Callable[[Any], bool]) -> Callable[[str], Any]:
+def within(kind: Any, limits: str, fits: Callable[[Any], bool]) -> Callable[[str], Any]:
+    """Make an option type: a ``kind(text)`` that ``fits``; ``limits`` says in words which do."""
+
     def read(text: str) -> Any:
         with contextlib.suppress(ValueError):
             if fits(value := kind(text)):
@@ -243,6 +245,7 @@ def handled(numbers: Iterable[int], handler: Callable[[int, Any], None]) -> Iter
     try:
         for number in before:
             signal.signal(number, once)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, before)  # A worker's may be blocked and wait.
         yield
     finally:
         for number, old in before.items():

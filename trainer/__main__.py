@@ -34,6 +34,7 @@ from trainer.training.config import (
 from trainer.util import DEVICES, PERIOD_S, kept
 
 Group = argparse.ArgumentParser | argparse._ArgumentGroup
+MOST_SEEDS = 1000
 
 
 @command(
@@ -48,9 +49,10 @@ def train(parser: argparse.ArgumentParser) -> None:
     add = what.add_argument
     add_scenario(what)
     add_fields(what, DEFAULTS, algorithm="NAME")
-    add_seed(what)
+    one_or_several = what.add_mutually_exclusive_group()
+    add_seed(one_or_several)
     several = "train a run for each seed, such as 1-5, side by side, in RUN_DIR/seed_N"
-    add("--seeds", type=seeds, metavar="FIRST-LAST", help=several)
+    one_or_several.add_argument("--seeds", type=seeds, metavar="FIRST-LAST", help=several)
     add_fields(what, DEFAULTS, **dict.fromkeys(EXTENT, "N"), success="MODULE:FUNCTION")
     start = "settings to start from: this project's, or those printed in the paper"
     add("--preset", choices=list(PRESETS), default="ours", help=start)
@@ -81,13 +83,16 @@ def train(parser: argparse.ArgumentParser) -> None:
             action.default = argparse.SUPPRESS
 
 
-def seeds(text: str) -> range:
-    """Read ``1-5`` or a single number."""
+def _range(text: str) -> range:
     first, _, last = text.partition("-")
-    numbers = range(int(first), int(last or first) + 1)
-    if not numbers:
-        raise ValueError(text)
-    return numbers
+    return range(int(first), int(last or first) + 1)
+
+
+def _in_reason(seeds: range) -> bool:
+    return 0 < seeds.stop - seeds.start <= MOST_SEEDS
+
+
+seeds = cli.within(_range, f"a range of 1 to {MOST_SEEDS} seeds, such as 1-5", _in_reason)
 
 
 class _Set(argparse.Action):
@@ -207,7 +212,7 @@ def experiment(parser: argparse.ArgumentParser) -> None:
     known = [*plan.EXPERIMENTS, "all", "status", "report", *plan.STUDIES]
     add("names", nargs="+", metavar="NAME", choices=known, help=words)
     seeds = "trainings of each algorithm in each setting"
-    add("--seeds", type=cli.whole_number(1, 1000), default=plan.DEFAULT_SEEDS, help=seeds)
+    add("--seeds", type=cli.whole_number(1, MOST_SEEDS), default=plan.DEFAULT_SEEDS, help=seeds)
     add("--scenario", choices=list(plan.TASKS), help="compute this task only (default: all)")
     add("--algorithm", choices=list(plan.LABELS), metavar="NAME", help="and this row only")
     settings = "and these settings only"

@@ -16,18 +16,23 @@ import threading
 import time
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from dataclasses import fields
 from enum import IntEnum
 from functools import cache
+from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from edge_runtime.files import check_writable, make_directory, try_to_lock_file, write_atomic
 from edge_runtime.util import UserError, open_regular
 
+Job = TypeVar("Job")
+Result = TypeVar("Result")
 PERIOD_S = 0.1  # Control period of an environment that names none
 DEVICES = ("cpu", "cuda")
 Range = tuple[float, float]
@@ -177,9 +182,42 @@ def cores() -> int:
     return len(os.sched_getaffinity(0))
 
 
+@contextmanager
+def side_by_side(
+    function: Callable[[Job], Result], jobs: Sequence[Job], processes: int, niceness: int
+) -> Iterator[dict[Future[Result], Job]]:
+    """Call ``function`` with each job, in a process of its own; yield the futures with their jobs.
+
+    At most ``processes`` run at once (0: one for each core). A process that dies fails its own job
+    alone, with UserError. An error in the block cancels all jobs.
+    """
+
+    def call(job: Job) -> Result:
+        with ProcessPoolExecutor(1, get_context("spawn"), begin_process, (niceness,)) as process:
+            try:
+                return process.submit(function, job).result()
+            except BrokenProcessPool:
+                raise UserError("its process died; the same command goes on") from None
+
+    with ThreadPoolExecutor(processes or cores()) as threads:
+        work = {threads.submit(call, job): job for job in jobs}
+        try:
+            yield work
+        except BaseException:
+            for each in work:
+                each.cancel()
+            while wait(work, 0.1).not_done:
+                for running in multiprocessing.active_children():
+                    running.kill()
+            raise
+
+
 def begin_process(niceness: int) -> None:
-    """Set up a worker: leave ^C to the parent, end with the parent, lower the priority."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Set up a worker: leave ^C to the parent, end with the parent, lower the priority.
+
+    A SIGINT waits for `edge_runtime.cli.handled`: the parent's may come before the work begins.
+    """
+    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     threading.Thread(target=die_with_parent, daemon=True).start()
     os.nice(niceness)
 

@@ -8,14 +8,12 @@ checkpoint, and ends with the same bits.
 import argparse
 import json
 import math
-import multiprocessing
 import sys
 import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import CancelledError, ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import CancelledError, as_completed
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
@@ -123,27 +121,13 @@ def compute_missing(arguments: argparse.Namespace, store: Store, wanted: Sequenc
 
 
 def run_here(jobs: Sequence[Job], processes: int = 0) -> Iterator[tuple[Job, str]]:
-    """Compute units in ``processes`` processes (0: one per core); yield how each unit ends.
-
-    Raises UserError if a process dies: the pool does not tell which unit it computed.
-    """
-    pool = ProcessPoolExecutor(
-        processes or util.cores(), multiprocessing.get_context("spawn"), util.begin_process,
-        (NICENESS,), max_tasks_per_child=1,
-    )  # fmt: skip
-    try:
-        work = {pool.submit(compute, job): job for job in jobs}
+    """Compute units in ``processes`` processes (0: one per core); yield how each unit ends."""
+    with util.side_by_side(compute, jobs, processes, NICENESS) as work:
         for future in as_completed(work):
             if time.time() > work[future].stop_at_s:
                 for each in work:  # A process would take seconds to start, only to stop.
                     each.cancel()
             yield work[future], _end(work[future], future.result)
-    except BaseException:
-        # Only on errors: a process killed while it waits for work keeps the queue's lock.
-        for process in multiprocessing.active_children():
-            process.kill()
-        raise
-    pool.shutdown()
 
 
 def _end(job: Job, result: Callable[[], str]) -> str:
@@ -152,8 +136,6 @@ def _end(job: Job, result: Callable[[], str]) -> str:
         return result()
     except CancelledError:
         return STOPPED
-    except BrokenProcessPool:
-        raise UserError("the process of a unit died; the same command goes on") from None
     except Exception as error:
         cause = getattr(error, "cause", error)  # Ray wraps it.
         if not isinstance(cause, UserError):

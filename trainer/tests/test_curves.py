@@ -2,7 +2,12 @@
 
 import json
 import math
+import os
+import signal
+import threading
+import time
 from contextlib import closing
+from multiprocessing import active_children
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +16,10 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
+from edge_runtime.cli import INTERRUPTED
 from edge_runtime.util import UserError
 from hil_tests.tests.shared.commands import call, refusal
+from trainer import util
 from trainer.__main__ import seeds
 from trainer.environments import make_environment
 from trainer.training import curves
@@ -83,18 +90,37 @@ def test_settings_that_differ_part_an_algorithms_runs_and_name_them(tmp_path, dr
     ]  # fmt: skip
 
 
-def test_seeds_are_trained_in_processes_of_their_own_and_drawn(tmp_path, capsys):
-    """The second; the first as any other run, here, where all is loaded."""
+def kill_the_first_and_interrupt_the_second(place: Path) -> None:
+    for seed in (2, 3):
+        while not (place / f"seed_{seed}/checkpoint.pt").exists():
+            time.sleep(0.05)
+        if seed == 2:
+            (worker,) = active_children()
+            worker.kill()
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_seeds_are_trained_in_processes_of_their_own_and_drawn(tmp_path, capsys, monkeypatch):
+    """Another process that dies ends none of them; after ^C no other begins."""
     assert [*seeds("1-3")] == [1, 2, 3]
-    few = ("--set", "evaluation_runs=2", "--set", "evaluate_every_steps=100")
-    judged = (*few, "--success", f"{__name__}:good")
-    for where in (("--seeds", "2", "--out", tmp_path), ("--out", tmp_path / "seed_1")):
-        status, out, _ = call(capsys, *TRAIN, *where, *judged)
-        assert (status, len(out.splitlines())) == (0, 1)
-    for seed in (1, 2):
-        (row,) = read_metrics(tmp_path / f"seed_{seed}")
+    monkeypatch.setattr(util, "cores", lambda: 1)
+    often = ("--set", "evaluation_runs=2", "--set", "evaluate_every_steps=100",
+             "--set", "checkpoint_every=1", "--success", f"{__name__}:good")  # fmt: skip
+    killer = threading.Thread(target=kill_the_first_and_interrupt_the_second, args=(tmp_path,))
+    killer.start()
+    long = (*TRAIN[:-1], 10**6, "--seeds", "2-4", "--out", tmp_path)
+    status, out, err = call(capsys, *long, *often)
+    killer.join()
+    assert (status, len(out.splitlines()), err.count("error: ")) == (INTERRUPTED, 1, 1), err
+    assert "error: seed 2: " in err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["seed_2", "seed_3"]
+    for seed in (2, 3):
+        row = read_metrics(tmp_path / f"seed_{seed}")[0]
         assert (row["outcome"], row["validation_success"]) == ("goal", "1.0")
-    assert "--out F.png" in refusal(capsys, "plot", tmp_path / "seed_1", tmp_path / "seed_2")
+    for options in (("--seeds", "1-3"), ("--seeds", "1-3", "--resume")):
+        assert "seed_2" in refusal(capsys, *TRAIN, *options, "--out", tmp_path, *often[-2:])
+    assert not (tmp_path / "seed_1").exists()
+    assert "--out F.png" in refusal(capsys, "plot", tmp_path / "seed_2", tmp_path / "seed_3")
     picture = tmp_path / "curves.png"
     assert call(capsys, "plot", tmp_path, "--x", "human_s", "--out", picture)[0] == 0
     with Image.open(picture) as image:

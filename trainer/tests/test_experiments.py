@@ -126,10 +126,11 @@ class TestUnit:
         assert not (straight.run_dir(UNIT) / CHECKPOINT_FILE).exists()
         assert str(straight.runs) not in (straight.run_dir(UNIT) / RECORD_FILE).read_text()
 
-    def test_a_process_that_dies_ends_the_command(self, store, monkeypatch):
+    def test_a_process_that_dies_fails_its_own_unit(self, store, monkeypatch, capsys):
         monkeypatch.setattr(util, "begin_process", os._exit)
-        with pytest.raises(UserError, match="goes on"):
-            list(compute.run_here([Job(UNIT, store)], 1))
+        jobs = [Job(UNIT, store, stop_at_s) for stop_at_s in (1e10, 1e11)]
+        assert sorted(compute.run_here(jobs, 1), key=repr) == [(job, FAILED) for job in jobs]
+        assert capsys.readouterr().err.count("goes on") == 2
 
     def test_one_that_is_out_of_time_goes_on_to_the_same_record(self, store, straight):
         """Stopped before its time began, and in the midst of it."""

@@ -9,12 +9,12 @@ import signal
 import sys
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import CancelledError, as_completed
 from contextlib import ExitStack, closing, redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import count
-from multiprocessing import active_children, get_context
+from multiprocessing import active_children
 from os import PathLike
 from pathlib import Path
 from statistics import fmean
@@ -25,7 +25,7 @@ import pandas as pd
 from bridge.environments import say_once
 from bridge.outcomes import success_estimate, success_share
 from bridge.report import ProgressBar
-from edge_runtime.cli import INTERRUPTED, quit_on_signals
+from edge_runtime.cli import BAD_INPUT, INTERRUPTED, quit_on_signals
 from edge_runtime.util import UserError, counted, name_in_file, read_json
 from trainer import util
 from trainer.environments import scenario_of
@@ -74,25 +74,30 @@ class Run:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    if arguments.seeds and vars(arguments).get("human") in HUMANS:
+    if not arguments.seeds:
+        return _status(_run(arguments))
+    if vars(arguments).get("human") in HUMANS:
         raise UserError("--seeds does not go with a person")
-    ends = [*_run_seeds(arguments)] if arguments.seeds else [_run(arguments).interrupted]
-    return INTERRUPTED if any(ends) else 0
+    return max(_run_seeds(arguments))
 
 
-def _run_seeds(arguments: argparse.Namespace) -> Iterator[bool]:
-    """Train a run of one thread for each seed, side by side; yield which were interrupted."""
+def _status(run: Run) -> int:
+    return INTERRUPTED if run.interrupted else 0
+
+
+def _run_seeds(arguments: argparse.Namespace) -> Iterator[int]:
+    """Train a run of one thread for each seed, side by side; yield how each ends, as a status."""
     jobs = []
     for seed in arguments.seeds:
         out = Path(arguments.out) / f"seed_{seed}"
         resume = arguments.resume and (out / CONFIG_FILE).is_file()
         own = {"seed": seed, "out": str(out), "resume": resume}
         jobs.append(argparse.Namespace(**{"threads": 1, **vars(arguments), **own}))
-    pool = ProcessPoolExecutor(
-        util.cores(), get_context("spawn"), util.begin_process, (0,), max_tasks_per_child=1
-    )
-    with pool, ProgressBar("seeds", len(jobs)) as bar:
-        work = [pool.submit(_run_quietly, job) for job in jobs]
+        _run(jobs[-1], only_check=True)  # All of them before hours go into the first
+    with (
+        util.side_by_side(_run_quietly, jobs, 0, 0) as work,
+        ProgressBar("seeds", len(jobs)) as bar,
+    ):
 
         def quit_all() -> bool:
             for each in work:
@@ -103,24 +108,29 @@ def _run_seeds(arguments: argparse.Namespace) -> Iterator[bool]:
 
         with quit_on_signals(quit_all):
             for each in as_completed(work):
-                printed, warned, interrupted = ("", [], True) if each.cancelled() else each.result()
                 bar.advance({})
+                try:
+                    status, printed, warned = each.result()
+                except CancelledError:
+                    status, printed, warned = INTERRUPTED, "", []
+                except (UserError, OSError) as error:
+                    status, printed = BAD_INPUT, ""
+                    warned = [f"error: seed {work[each].seed}: {UserError(error)}"]
                 for line in warned:
                     say_once(line)
                 print(printed, end="")
-                yield interrupted
+                yield status
 
 
-def _run_quietly(arguments: argparse.Namespace) -> tuple[str, list[str], bool]:
-    """Return what a run prints at its end, its warnings, and whether it was interrupted."""
+def _run_quietly(arguments: argparse.Namespace) -> tuple[int, str, list[str]]:
+    """Return a run's exit status, what it prints at its end, and its warnings."""
     with redirect_stdout(io.StringIO()) as printed, redirect_stderr(io.StringIO()) as said:
-        interrupted = _run(arguments).interrupted
+        status = _status(_run(arguments))
     lines = filter(None, said.getvalue().splitlines())
-    warned = [line for line in lines if not line.startswith("training: ")]
-    return printed.getvalue(), warned, interrupted
+    return status, printed.getvalue(), [line for line in lines if not line.startswith("training: ")]
 
 
-def _run(arguments: argparse.Namespace) -> Run:
+def _run(arguments: argparse.Namespace, only_check: bool = False) -> Run:
     typed = {name: value for name, value in vars(arguments).items() if name in TYPED}
     path = Path(arguments.out) / CONFIG_FILE
     saved: dict[str, Any] = {}
@@ -130,7 +140,7 @@ def _run(arguments: argparse.Namespace) -> Run:
             # A module's name must be typed: none is imported because a file names it.
             name_in_file(str(saved.get(name)), f"{arguments.out} was trained with", f"--{name}")
     values = {**saved, **typed, **dict(map(parse_setting, arguments.set))}
-    return _begin(values.pop("preset", "ours"), values, arguments)
+    return _begin(values.pop("preset", "ours"), values, arguments, only_check)
 
 
 def train(
@@ -171,7 +181,9 @@ def train(
     return _begin(preset, values, argparse.Namespace(**options_given))
 
 
-def _begin(preset: str, values: dict[str, Any], how: argparse.Namespace) -> Run:
+def _begin(
+    preset: str, values: dict[str, Any], how: argparse.Namespace, only_check: bool = False
+) -> Run:
     """Train with these settings; ``how`` holds the options that do not decide the result."""
     if not SLOWEST <= how.speed <= FASTEST:
         raise UserError(f"speed must be from {SLOWEST} to {FASTEST}: {how.speed}")
@@ -191,7 +203,8 @@ def _begin(preset: str, values: dict[str, Any], how: argparse.Namespace) -> Run:
         closing(environment_of(config)) as env,
     ):
         config = make_config(preset, values, env)
-        return _train(config, run_dir, env, how)
+        resume, run = check_directory(run_dir, config, how.resume), Run(run_dir)
+        return run if only_check else _train(config, run_dir, env, how, resume)
 
 
 def _new_directory(config: RunConfig) -> Path:
@@ -200,8 +213,10 @@ def _new_directory(config: RunConfig) -> Path:
     return next(path for path in paths if not path.exists())
 
 
-def _train(config: RunConfig, run_dir: Path, env: Any, how: argparse.Namespace) -> Run:
-    end_s, resume = util.deadline_s(how.max_minutes), check_directory(run_dir, config, how.resume)
+def _train(
+    config: RunConfig, run_dir: Path, env: Any, how: argparse.Namespace, resume: bool
+) -> Run:
+    end_s = util.deadline_s(how.max_minutes)
     with ExitStack() as stack:
         if config.human == PERSON:
             from trainer.person.run import training_with_person
@@ -287,7 +302,7 @@ def check_directory(run_dir: Path, config: RunConfig, resume: bool) -> bool:
         begun = (run_dir / CONFIG_FILE).is_file()
         if not begun or len(read_metrics(run_dir)) > config.checkpoint_every:
             raise UserError(f"{run_dir} holds no checkpoint to resume from")
-        print(f"{run_dir} holds no checkpoint yet: it begins anew", file=sys.stderr)
+        say_once(f"{run_dir} holds no checkpoint yet: it begins anew")
     if resume:
         _check_settings(run_dir, config)
     return started
