@@ -21,7 +21,7 @@ from bridge.environments import finite
 from bridge.inbound import BRAKE_PERIODS, NO_COMMAND, Decision
 from bridge.outcomes import COLLISION, GOAL, is_told, settled, success_estimate
 from edge_runtime.files import write_atomic
-from edge_runtime.util import counted, printable
+from edge_runtime.util import UserError, counted, printable
 
 ACCELERATIONS = ("lateral_acceleration_mps2", "longitudinal_acceleration_mps2")
 QUANTITIES = {
@@ -63,7 +63,8 @@ def summarise(
     for result, outcome in zip(results, settled(r.outcome for r in results), strict=True):
         result.outcome = outcome
     outcomes = Counter(result.outcome for result in results)
-    success = success_estimate(outcomes[GOAL], len(results)) if is_told(outcomes) else None
+    told = is_told(outcomes)
+    success = success_estimate(outcomes[GOAL], len(results)) if told else None
     columns = {key: [getattr(row, name) for row in results] for key, name in QUANTITIES.items()}
     return {
         "scenario": scenario,
@@ -71,7 +72,7 @@ def summarise(
         "episodes": len(results),
         "success_rate": success and success.value,
         "success_interval": success and [success.low, success.high],
-        "collision_rate": outcomes[COLLISION] / len(results),
+        "collision_rate": outcomes[COLLISION] / len(results) if told else None,
         **{
             key: {"mean": of_known(values), "std": of_known(values, np.std)}
             for key, values in columns.items()
@@ -192,6 +193,8 @@ def _reasons(noun: str, counts: Mapping[str, int]) -> str:
 
 def write_figure(figure: Any, path: Path) -> None:
     """Write a figure of matplotlib as a PNG of few colours, which takes a third of the bytes."""
+    if path.suffix != ".png":
+        raise UserError(f"{path}: the file's name must end in .png")
     drawn, buffer = io.BytesIO(), io.BytesIO()
     figure.savefig(drawn, format="png", dpi=DOTS_PER_INCH)
     picture = Image.open(drawn).convert("RGB").quantize(KEPT_COLOURS, dither=Image.Dither.NONE)

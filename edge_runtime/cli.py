@@ -45,7 +45,7 @@ class HelpFormatter(argparse.ArgumentDefaultsHelpFormatter):
     def _get_help_string(self, action: argparse.Action) -> Optional[str]:
         # By identity: 0 is a default worth showing, though it equals False.
         hidden = any(action.default is nothing for nothing in (None, False))
-        if hidden or action.default == [] or "(default: " in (action.help or ""):
+        if hidden or action.default in ([], "") or "(default: " in (action.help or ""):
             return action.help
         return super()._get_help_string(action)
 

@@ -79,7 +79,8 @@ def train(parser: argparse.ArgumentParser) -> None:
     add_threads(how)
     for action in parser._actions:
         if action.dest in TYPED:  # Only typed options override the config of a resumed run.
-            action.help = f"{action.help} (default: {action.default})"
+            default = "none" if action.default == "" else action.default
+            action.help = f"{action.help} (default: {default})"
             action.default = argparse.SUPPRESS
 
 
@@ -167,6 +168,7 @@ def evaluate(parser: argparse.ArgumentParser) -> None:
     scenes = scenes.replace("%", "%%")
     add("--condition", choices=CONDITIONS, default="nominal", help=scenes)
     add_latency(parser, "simulated network between policy and vehicle")
+    add_fields(parser, DEFAULTS, success="MODULE:FUNCTION")
     count = "number of episodes"
     add("--runs", type=cli.positive, default=50, metavar="N", help=count)
     add_seed(parser, " of the first episode; each next episode adds 1")

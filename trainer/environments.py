@@ -32,6 +32,7 @@ from trainer.util import PERIOD_S
 COMMAND_NOISE = 0.05 * 2.0
 """Standard deviation of the noise condition: 5 % of the whole control domain (section VII-D)."""
 MOST_STEPS = 1000  # Episode limit where the environment has none
+BEYOND = "an action beyond its range, or a number that is not finite"
 BEARABLE = 1e4  # Larger observed numbers get a warning: networks learn from numbers near 1
 
 
@@ -110,6 +111,16 @@ def as_array(layout: ReplayLayout, entries: Mapping[str, NDArray[Any]]) -> NDArr
     for name, entry in entries.items():
         (packed[name] if packed.dtype.names else packed)[...] = entry
     return packed
+
+
+def check_recorded(env: Any, path: Path, observation: NDArray[Any], action: Action) -> None:
+    """Raise UserError unless a step recorded in ``path`` could be one of ``env``."""
+    wanted = env.layout.shape, env.layout.dtype, env.action_space.shape
+    if (observation.shape, observation.dtype, action.shape) != wanted:
+        raise UserError(f"{path} holds observations or actions that are none of {env.scenario}")
+    entries = entries_of(observation, "").values()
+    if not (np.abs(action).max() <= 1.0 and all(np.isfinite(entry).all() for entry in entries)):
+        raise UserError(f"{path} holds {BEYOND}")
 
 
 def own_environment(env: Any) -> Any:

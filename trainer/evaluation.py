@@ -53,8 +53,8 @@ ActTogether = Callable[[Observation], Action]  # Actions for a batch of observat
 
 def run(arguments: argparse.Namespace) -> int:
     check_writable(arguments.out)
-    names = ("policy", "scenario", "runs", "seed", "condition", "latency", "public_key", "video",
-             "rerun")  # fmt: skip
+    names = ("policy", "scenario", "runs", "seed", "condition", "latency", "success", "public_key",
+             "video", "rerun")  # fmt: skip
     evaluation = evaluate(**{name: getattr(arguments, name) for name in names})
     if not arguments.out:
         print(json.dumps(evaluation.report, indent=2))
@@ -95,6 +95,7 @@ def evaluate(
     seed: int = 0,
     condition: str = "nominal",
     latency: str = "none",
+    success: str = "",
     public_key: str | None = None,
     video: str | PathLike[str] | None = None,
     rerun: str | None = None,
@@ -124,7 +125,7 @@ def evaluate(
     scenario = scenario or name_in_file(of_training, f"{policy} was trained in", "--scenario")
     scenario, seeds = scenario_of(scenario), range(seed, seed + runs)
     with (
-        closing(make_environment(scenario, condition, period_s=period_s)) as env,
+        closing(make_environment(scenario, condition, False, period_s, success)) as env,
         limited_threads(1),  # The last bits must not depend on the number of cores.
         ProgressBar("evaluating", runs) as bar,
         ExitStack() as stack,

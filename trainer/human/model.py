@@ -23,7 +23,7 @@ from trainer.human import FIELDS, MODEL_FILE, HumanModelConfig
 from trainer.human.guide import Driver, HumanGuide, steps_held
 from trainer.learner.networks import FRAMES_SPACE, Actor, tensors
 from trainer.person import vector
-from trainer.person.recording import find_recordings, read_episodes, read_steps
+from trainer.person.recording import find_recordings, read_episodes_of
 from trainer.util import Purpose, claimed, episode_seed, load_torch, random_stream, save_torch
 
 REFINING_PARTS = 20  # Steps in which the learning rate falls while a model is refined
@@ -133,9 +133,7 @@ def _train(arguments: argparse.Namespace, config: HumanModelConfig, directory: P
         losses = imitate(model, env, arguments.seed)
     else:
         recordings = find_recordings([Path(place) for place in arguments.recordings])
-        with util.fitting(f"these recordings hold steps that are none of {env.scenario}"):
-            taken_over = demonstrate(model, recordings, env.scenario)
-            model.learn(0)  # It raises where shapes differ.
+        taken_over = demonstrate(model, recordings, env)
         about |= {"recordings": [str(path) for path in recordings], "interventions": taken_over}
         # As many gradient steps as with the expert, but without episodes in between
         losses = (model.learn(config.updates_per_episode) for _ in range(config.episodes))
@@ -189,7 +187,7 @@ def imitate(model: HumanModel, env: Any, seed: int) -> Iterator[float]:
         yield model.learn(config.updates_per_episode)
 
 
-def demonstrate(model: HumanModel, recordings: Sequence[Path], scenario: str) -> int:
+def demonstrate(model: HumanModel, recordings: Sequence[Path], env: Any) -> int:
     """Give the model every recorded step in which the person was in control; count take-overs.
 
     During a hand-over the model gets the hands' action, not the blend that was applied. An episode
@@ -197,10 +195,7 @@ def demonstrate(model: HumanModel, recordings: Sequence[Path], scenario: str) ->
     """
     interventions = 0
     for path in recordings:
-        for episode in read_episodes(read_steps(path)):
-            first = episode[0]
-            if first.scenario != scenario:
-                raise UserError(f"{path} was driven in {first.scenario}, not in {scenario}")
+        for episode in read_episodes_of(env, path):
             interventions += sum(step.first for step in episode)
             for step in episode:
                 if step.control == "human":

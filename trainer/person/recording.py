@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from bridge.outcomes import DISCARDED
 from bridge.recording import Recording, new_recording_at
 from edge_runtime.util import UserError
+from trainer.environments import check_recorded
 from trainer.learner.replay import Transition
 from trainer.person import Amount, Control, vector
 
@@ -135,9 +136,9 @@ def sittings(directory: Path) -> list[Path]:
     return sorted(paths, key=_number)
 
 
-def _nonempty(directory: Path) -> list[Path]:
-    """Return the recordings that hold anything: a power cut may leave an empty file."""
-    return [path for path in sittings(directory) if path.stat().st_size > MAGIC_SIZE]
+def nonempty(paths: Iterable[Path]) -> list[Path]:
+    """Return the files that hold anything: a power cut may leave an empty one."""
+    return [path for path in paths if path.stat().st_size > MAGIC_SIZE]
 
 
 def _number(path: Path) -> int:
@@ -148,7 +149,8 @@ def find_recordings(places: Sequence[Path]) -> list[Path]:
     """Return the recordings in files, directories and runs; UserError where a place has none."""
     recordings: list[Path] = []
     for place in places:
-        paths = [place] if place.is_file() else _nonempty(place) or _nonempty(place / DIRECTORY)
+        folders = (sittings(place), sittings(place / DIRECTORY))
+        paths = [place] if place.is_file() else next(filter(None, map(nonempty, folders)), [])
         if not paths:
             raise UserError(f"no recording in {place}: expected sitting-NNNN.mcap, or such files")
         recordings += [path for path in paths if path not in recordings]
@@ -193,7 +195,17 @@ def read_episodes(steps: Iterable[RecordedStep]) -> Iterator[list[RecordedStep]]
             yield episode
 
 
+def read_episodes_of(env: Any, path: Path) -> Iterator[list[RecordedStep]]:
+    """Yield a recording's episodes, as `read_episodes` does; UserError for another task's."""
+    for episode in read_episodes(read_steps(path)):
+        if (scenario := episode[0].scenario) != env.scenario:
+            raise UserError(f"{path} was driven in {scenario}, not in {env.scenario}")
+        for step, action in ((s, a) for s in episode for a in (s.action, s.human_action)):
+            check_recorded(env, path, step.observation, vector(action))
+        yield episode
+
+
 def steps_since(directory: Path, position: tuple[int, int]) -> Iterator[RecordedStep]:
     """Yield all sittings' steps from ``position`` (sitting, index) on."""
-    for path in _nonempty(directory):
+    for path in nonempty(sittings(directory)):
         yield from (step for step in read_steps(path) if (step.sitting, step.index) >= position)

@@ -77,6 +77,17 @@ def test_each_algorithm_is_a_line_named_with_a_band_up_to_the_shortest_run(tmp_p
     assert set(alone.get_ydata()) == {5.0}
 
 
+def test_runs_that_share_no_part_of_an_axis_are_drawn_each_for_itself(tmp_path, drawn):
+    for number in range(2):
+        run_of(tmp_path / f"seed_{number}", "per_td3", 12, 1.0, True)
+    curves.write_learning_curve(tmp_path, out="f.png", x="human_s")
+    panels = {panel.get_title(): panel for panel in drawn[0].axes}
+    lines = panels["return in training (without shaping)"].get_lines()
+    assert [line.get_xdata().tolist() for line in lines] == [[0.0] * 12] * 2
+    (text,) = drawn[0].axes[-1].get_legend().get_texts()
+    assert text.get_text() == "per_td3"
+
+
 def test_settings_that_differ_part_an_algorithms_runs_and_name_them(tmp_path, drawn):
     """Not the seed, nor another algorithm's settings."""
     runs = [("phil_td3", 1, 40.0), ("phil_td3", 2, 40.0), ("phil_td3", 1, 10.0), ("hi_td3", 1, 5.0)]
@@ -120,6 +131,12 @@ def test_seeds_are_trained_in_processes_of_their_own_and_drawn(tmp_path, capsys,
     for options in (("--seeds", "1-3"), ("--seeds", "1-3", "--resume")):
         assert "seed_2" in refusal(capsys, *TRAIN, *options, "--out", tmp_path, *often[-2:])
     assert not (tmp_path / "seed_1").exists()
+    judged = (tmp_path / "seed_3", "--success", f"{__name__}:good", "--runs", 1)
+    assert json.loads(call(capsys, "evaluate", *judged)[1])["success_rate"] == 1.0
+    unknown = json.loads(call(capsys, "evaluate", *judged[:1], "--runs", 1)[1])
+    assert (unknown["success_rate"], unknown["collision_rate"]) == (None, None)
+    for name in ("curves.pdf", "curves"):
+        assert ".png" in refusal(capsys, "plot", tmp_path, "--out", tmp_path / name)
     assert "--out F.png" in refusal(capsys, "plot", tmp_path / "seed_2", tmp_path / "seed_3")
     picture = tmp_path / "curves.png"
     assert call(capsys, "plot", tmp_path, "--x", "human_s", "--out", picture)[0] == 0

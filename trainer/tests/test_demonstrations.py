@@ -1,11 +1,16 @@
 """Drives that fill the replay before the first step: sittings, recordings and data sets."""
 
+import math
+import shutil
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
+from pyarrow import parquet as pq
 
 from bridge.__main__ import main as bridge
 from bridge.fork import read_episodes
@@ -16,6 +21,7 @@ from hil_tests.tests.shared.messages import make_feedback
 from trainer.environments import make_environment, task_of
 from trainer.learner.config import LearnerConfig
 from trainer.person import PERSON
+from trainer.person.recording import Recorder, packed
 from trainer.person.tests.people import record, recorded_step
 from trainer.training.config import RunConfig
 from trainer.training.demonstrations import read_demonstrations
@@ -50,16 +56,78 @@ def test_a_recording_of_another_task_is_refused():
         next(read_demonstrations(DRIVE, make_environment("congestion")))
 
 
-def test_a_data_set_gives_back_what_was_exported(drive, tmp_path):
-    out = tmp_path / "set"
+@pytest.fixture(scope="module")
+def data_set(tmp_path_factory):
+    out = tmp_path_factory.mktemp("sets") / "set"
     assert bridge(["export", str(DRIVE), "--format", "lerobot", "--out", str(out)]) == 0
-    (episode, *_) = read_demonstrations(out, make_environment("left_turn"))
+    return out
+
+
+def test_a_data_set_gives_back_what_was_exported(drive, data_set):
+    (episode, *_) = read_demonstrations(data_set, make_environment("left_turn"))
     for step, transition in enumerate(islice(episode, 1, 20), 1):
         wanted = seen(drive, step)
         assert transition.action == pytest.approx(drive.commands[step].action, abs=1e-6)
         # The video is not exact.
         assert np.abs(transition.observation.astype(int) - wanted).mean() < 3.0
         assert (transition.next_observation[0] == transition.observation[1]).all()
+
+
+def rewrite_info(old: str, new: str, folder: Path) -> None:
+    path = folder / "meta/info.json"
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+
+
+def scale_actions(folder: Path) -> None:
+    table = pq.read_table(path := next(folder.glob("data/*/*.parquet")))
+    column = table.column_names.index("action")
+    pq.write_table(table.set_column(column, "action", pa.array(np.full(len(table), 30.0))), path)
+
+
+def truncate(pattern: str, folder: Path) -> None:
+    path = next(folder.glob(pattern))
+    path.write_bytes(path.read_bytes()[:100])
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        partial(rewrite_info, '"pedal"', '"steering"'),
+        partial(rewrite_info, '"fps": 10', '"fps": 30'),
+        partial(rewrite_info, '"features"', '"traits"'),
+        partial(truncate, "data/*/*.parquet"), partial(truncate, "videos/**/*.mp4"),
+        lambda folder: shutil.rmtree(folder / "data"),
+        lambda folder: shutil.rmtree(folder / "videos"), scale_actions,
+    ],
+)  # fmt: skip
+def test_a_damaged_data_set_or_one_of_another_task_is_refused(spoil, data_set, tmp_path):
+    spoil(shutil.copytree(data_set, tmp_path / "spoilt"))
+    with pytest.raises(UserError, match="spoilt"):
+        list(read_demonstrations(tmp_path / "spoilt", make_environment("left_turn")))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"seen": packed(np.zeros((2, 9, 9), np.uint8))}, {"action": 3.0}, {"action": math.nan},
+        {"action": [0.1, 0.2]}, {"seen": packed(np.full((2, 45, 80), math.nan))},
+        {"scenario": "congestion"},
+    ],
+)  # fmt: skip
+def test_a_sitting_that_does_not_fit_is_refused_by_who_learns_from_it(changes, tmp_path, capsys):
+    record(tmp_path, [recorded_step(1, 0, human=True, control="human", **changes)])
+    for words in (("train", "--demonstrations"), ("human", "--from")):
+        assert "sitting-0001" in refusal(capsys, *words, tmp_path, "--out", tmp_path / "out")
+
+
+def test_what_a_power_cut_left_empty_is_passed_over(tmp_path):
+    record(tmp_path, [recorded_step(2, n, step=n, terminated=n == 3) for n in range(4)])
+    (tmp_path / "sitting-0002.mcap").touch()
+    Recorder(tmp_path)  # Killed before its first step
+    (episode,) = read_demonstrations(tmp_path, make_environment("left_turn"))
+    assert len(episode) == 4
 
 
 def test_sittings_fill_the_replay_before_the_first_step(tmp_path):
@@ -141,6 +209,7 @@ def test_a_drive_of_another_task_or_without_movement_is_refused(tmp_path):
             next(read_demonstrations(path, make_environment(scenario)))
 
 
-def test_an_empty_place_is_refused(tmp_path, capsys):
-    options = ["train", "--out", str(tmp_path / "run"), "--demonstrations", str(tmp_path)]
-    assert "no recording" in refusal(capsys, *options)
+@pytest.mark.parametrize(("place", "said"), [(".", "no recording"), ("human:0", "human:0")])
+def test_an_empty_place_is_refused(place, said, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert said in refusal(capsys, "train", "--out", "run", "--demonstrations", place)

@@ -23,7 +23,7 @@ from typing import Any
 import pandas as pd
 
 from bridge.environments import say_once
-from bridge.outcomes import success_estimate, success_share
+from bridge.outcomes import is_told, success_estimate, success_share
 from bridge.report import ProgressBar
 from edge_runtime.cli import BAD_INPUT, INTERRUPTED, quit_on_signals
 from edge_runtime.util import UserError, counted, name_in_file, read_json
@@ -281,7 +281,8 @@ def _summary(rows: pd.DataFrame, config: RunConfig) -> str:
     amounts = {"episode": len(rows), "step": last.total_steps, "update": last.updates}
     parts = [counted(count, name) for name, count in amounts.items()]
     parts.append(f"{counted(last.total_takeovers, 'take-over')} with {last.total_human_s:.0f} s")
-    parts.append(counted(last.total_failures, "failure"))
+    if is_told(rows.outcome):
+        parts.append(counted(last.total_failures, "failure"))
     if confirmed == confirmed:  # Not NaN: an actor was kept
         count = config.confirmation_factor * config.evaluation_runs
         share = success_estimate(round(confirmed * count), count).as_share()

@@ -103,16 +103,15 @@ def _curves(run_dir: Path) -> pd.DataFrame:
 
 
 def _draw(panel: Any, label: str, color: str, runs: list[pd.Series]) -> None:
-    """Draw the mean of runs, each a column over its own steps."""
-    runs = [run.dropna() for run in runs]
-    runs = [run for run in runs if len(run)]
-    if not runs:
+    """Draw the mean of runs, each a column over its own steps; each run where none is shared."""
+    runs = [run for run in (run.dropna() for run in runs) if len(run)]
+    begin = max((run.index[0] for run in runs), default=0)
+    end = min((run.index[-1] for run in runs), default=0)
+    if len(runs) < 2 or begin >= end:
+        for number, run in enumerate(runs):
+            panel.plot(run, ".-", color=color, label=label if not number else None)
         return
-    if len(runs) == 1:
-        panel.plot(runs[0], ".-", color=color, label=label)
-        return
-    begin, end = max(run.index[0] for run in runs), min(run.index[-1] for run in runs)
-    at = np.linspace(begin, max(begin, end), POINTS)
+    at = np.linspace(begin, end, POINTS)
     values = np.array([np.interp(at, run.index, run) for run in runs])
     mean, low, high, _ = np.array([mean_estimate(column) for column in values.T]).T
     panel.plot(at, mean, color=color, label=f"{label}, {len(runs)} runs")

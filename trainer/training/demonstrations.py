@@ -6,6 +6,7 @@ again. A LeRobot data set holds observations and actions, with one picture per f
 rebuilt from earlier frames. ``human:N`` stands for N drives of a scripted human.
 """
 
+import math
 import re
 from collections.abc import Iterator
 from dataclasses import replace
@@ -22,17 +23,17 @@ from bridge.environments import NOMINAL
 from bridge.messages import is_picture
 from bridge.recording import Recording, choose_vehicle, valid_messages
 from edge_runtime.manifest import Layout
-from edge_runtime.util import UserError
+from edge_runtime.util import UserError, read_json
 from edge_runtime.wire import DRIVE, Feedback, State
-from trainer.environments import as_array, inner, task_of
+from trainer.environments import BEYOND, as_array, check_recorded, inner, outer, task_of
 from trainer.evaluation import Drive, Driver
 from trainer.learner.replay import Transition
-from trainer.person.recording import TOPIC, RecordedStep, find_recordings, read_episodes, read_steps
-from trainer.util import Purpose, episode_seed
+from trainer.person.recording import TOPIC, find_recordings, nonempty, read_episodes_of
+from trainer.util import Purpose, episode_seed, fitting
 
 Episode = list[Transition]
 REWARD = "next.reward"  # Column of a data set; ours have none
-SCRIPTED = re.compile(r"human:(\d+)")
+SCRIPTED = re.compile(r"human:([1-9]\d*)")
 """Instead of a path: N drives of the run's scripted human, or of the expert beside a person."""
 
 
@@ -42,13 +43,17 @@ def read_demonstrations(place: Path, env: Any) -> Iterator[Episode]:
     Raises UserError: nothing of that kind, or of another task.
     """
     if (place / "meta/info.json").is_file():
-        yield from _from_dataset(place, env)
+        with fitting(f"{place} is damaged, or not of {env.scenario}"):
+            yield from _from_dataset(place, env)
         return
-    paths = sorted(place.glob("*.mcap")) if place.is_dir() else [place]
+    paths = nonempty(sorted(place.glob("*.mcap"))) if place.is_dir() else [place]
     for path in paths or find_recordings([place]):
         channel = next((channel for channel, _ in Recording(path).messages()), None)
-        if channel is not None and channel.topic == TOPIC:
-            yield from (_from_sitting(steps, env) for steps in read_episodes(read_steps(path)))
+        if channel is None:  # A sitting that was killed before its first step
+            continue
+        if channel.topic == TOPIC:
+            for steps in read_episodes_of(env, path):
+                yield [step.transition() for step in steps]
         else:
             drives = fork.read_episodes(path)
             again = (_driven_again(drive, env) for drive in drives)
@@ -64,12 +69,6 @@ def drive_demonstrations(driver: Driver, env: Any, seed: int, episodes: int) -> 
             drive.step(driver.act(drive.observation))
             episode.append(replace(drive.transition, overruled=None, human=True))
         yield episode
-
-
-def _from_sitting(steps: list[RecordedStep], env: Any) -> Episode:
-    if steps[0].scenario != env.scenario:
-        raise UserError(f"a demonstration is of {steps[0].scenario}, not of {env.scenario}")
-    return [step.transition() for step in steps]
 
 
 def _driven_again(drive: fork.RecordedEpisode, env: Any) -> Episode:
@@ -144,7 +143,12 @@ def _from_dataset(folder: Path, env: Any) -> Iterator[Episode]:
             "a data set needs av and pyarrow: pip install 'phil-hil[lerobot]'"
         ) from None
 
-    entries = task_of(env).observation
+    task, info = task_of(env), read_json(folder / "meta/info.json", "data set")
+    wanted, rate = [row.name for row in task.action], 1.0 / task.control_period_s
+    names, fps = info["features"]["action"]["names"] or wanted, info["fps"]
+    if names != wanted or not math.isclose(fps, rate, rel_tol=1e-3):
+        raise UserError(f"{folder} has actions {names} at {fps:g} Hz, not {wanted} at {rate:g}")
+    entries = task.observation
     plain = [name for name, entry in entries.items() if not is_picture(entry)]
     keys = {name: "observation.state" if len(plain) == 1 else f"observation.{name}"
             for name in plain}  # fmt: skip
@@ -161,11 +165,17 @@ def _from_dataset(folder: Path, env: Any) -> Iterator[Episode]:
         colours = "rgb24" if entry.shape[-1] == 3 else "gray"
         frames = [f.to_ndarray(format=colours) for v in videos for f in av.open(str(v)).decode()]
         column[...] = _stacked(np.array(frames), column.shape, table["episode_index"])
-    actions = [inner(env.action_range, action) for action in table["action"]]
-    rewards = table.get(REWARD, np.zeros(len(actions)))
+    given = np.reshape(table["action"], (len(observations), -1))
+    actions = [inner(env.action_range, action) for action in given]
+    rewards = np.asarray(table.get(REWARD, np.zeros(len(actions))))
+    same = np.isclose(given, [outer(env.action_range, action) for action in actions], atol=1e-4)
+    if not (same.all() and np.isfinite(rewards).all()):
+        raise UserError(f"{folder} holds {BEYOND}")
     done = table.get("next.done", np.zeros(len(actions), bool))
     for _, group in groupby(range(len(actions)), key=lambda row: table["episode_index"][row]):
         rows = list(group)
+        for row in rows:
+            check_recorded(env, folder, observations[row], actions[row])
         yield [
             Transition(observations[row], actions[row], float(rewards[row]), observations[after],
                        False, bool(done[row]), human=True)

@@ -18,6 +18,7 @@ from bridge.network import parse_spec
 from bridge.outcomes import DISCARDED, GOAL, is_told, success_share
 from bridge.report import EpisodeResult
 from edge_runtime.files import write_json
+from edge_runtime.util import UserError
 from trainer import environments, evaluation, util
 from trainer.environments import DelayedVehicle
 from trainer.evaluation import BEST_FILE, CHECKPOINT_FILE, NO_NETWORK, TogetherDriver
@@ -246,6 +247,8 @@ class TrainingRun:
                     self._shown_steps += transition.human
                     paid |= transition.reward != 0.0
                 self.learning.release()
+            if not self.learning.replay.added:
+                raise UserError(f"{config.demonstrations} shows no step")
             if not paid and self.algorithm.rewarded and self.algorithm.q_term:
                 say_once(f"{config.demonstrations} {UNPAID}")
 

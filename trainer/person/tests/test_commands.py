@@ -45,7 +45,7 @@ WRONG = [
     (HUMAN, (WIRE,), f"`python -m bridge view {WIRE}` shows one"),
     (HUMAN, ("{tmp}/policy",), "nobody took over"),
     (HUMAN, (MINE, "--scenario", "congestion"), "was driven in left_turn, not in congestion"),
-    (HUMAN, (MINE, "{tmp}/crafted"), "steps that are none of left_turn"),
+    (HUMAN, (MINE, "{tmp}/crafted"), "actions that are none of left_turn"),
 ]
 
 
