@@ -64,7 +64,7 @@ accept: $(STAMP)  ## may the shipped policies drive? a page for each in runs/acc
 	$(ACCEPT) --policy results/policies/congestion.onnx --env congestion --out runs/accept/congestion
 
 recording: $(STAMP)  ## drive and record anew what the next release is replayed against
-	$(BIN)/python hil_tests/recordings/make_recording.py
+	$(BIN)/python hil_tests/tests/make_recording.py
 
 $(MUTATION_STAMP): requirements/mutation.txt
 	$(PYTHON) -m venv $(MUTATION)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import os
 import re
-import shutil
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
@@ -24,7 +23,7 @@ from bridge.ports import add_options
 from bridge.replay import RecordedDrive, key_of
 from edge_runtime.cli import ArgumentParser, examples, sigterm_as_interrupt
 from edge_runtime.config import NONE
-from edge_runtime.files import check_writable, write_json
+from edge_runtime.files import check_writable, draft_of, write_json
 from edge_runtime.manifest import Layout, Task
 from edge_runtime.util import UserError, counted
 from edge_runtime.wire import Command, State, is_foreign
@@ -66,13 +65,8 @@ def run(arguments: Any) -> int:
         raise UserError(f"{out} exists; choose another name: no data set is lost")
     check_writable(out)
     drive = RecordedDrive(Path(arguments.recording), arguments.vehicle_id)
-    part = out.with_name(f".{out.name}.{os.getpid()}.part")
-    with sigterm_as_interrupt():
-        try:
-            frames = _export(drive, part)
-            os.rename(part, out)
-        finally:
-            shutil.rmtree(part, ignore_errors=True)
+    with sigterm_as_interrupt(), draft_of(out) as draft:
+        frames = _export(drive, draft)
     print(f"wrote {out}: {counted(frames, 'frame')}")
     return 0
 

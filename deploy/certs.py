@@ -12,7 +12,6 @@ import datetime
 import ipaddress
 import os
 import re
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,7 +24,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from edge_runtime import tls
 from edge_runtime.cli import command, whole_number
-from edge_runtime.files import make_directory, write_atomic
+from edge_runtime.files import draft_of, write_atomic
 from edge_runtime.util import DEFAULT_PUBLIC_KEY, UserError, read_bytes
 from edge_runtime.wire import DEFAULT_VEHICLE_ID
 
@@ -138,16 +137,11 @@ def _host(text: str) -> x509.GeneralName:
 
 def _write_folder(folder: Path, authority: CertificatePair, files: dict[str, bytes]) -> None:
     """Fill a private draft and rename it, so that the folder is whole or absent."""
-    draft = folder.with_name(f".{folder.name}.{os.getpid()}")
-    make_directory(folder.parent)
-    try:
+    with draft_of(folder) as draft:
         draft.mkdir(mode=0o700)
         write_atomic(draft / tls.CA_FILE, authority.certificate.public_bytes(_PEM))
         for name, data in files.items():
             write_private(draft / name, data)
-        draft.rename(folder)
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)
 
 
 def _pem(key: ec.EllipticCurvePrivateKey | ed25519.Ed25519PrivateKey) -> bytes:

@@ -10,8 +10,9 @@ import fcntl
 import json
 import os
 import secrets
+import shutil
 from pathlib import Path
-from typing import Any, Optional
+from typing import Any, Iterator, Optional
 
 from edge_runtime.util import PathLike, UserError
 
@@ -47,6 +48,21 @@ def check_writable(path: Optional[PathLike]) -> Optional[PathLike]:
     if not directory.is_dir() or not os.access(str(directory), os.W_OK | os.X_OK):
         raise UserError(f"cannot write {target}: Not a directory to write in: {directory}")
     return os.path.abspath(path)
+
+
+@contextlib.contextmanager
+def draft_of(target: Path) -> Iterator[Path]:
+    """Yield a hidden place: what is made there gets the name `target`, unless an error comes."""
+    make_directory(target.parent)
+    draft = target.with_name(f".{target.name}.{os.getpid()}{target.suffix}")
+    try:
+        yield draft
+        os.replace(draft, target)
+    finally:
+        if draft.is_dir():
+            shutil.rmtree(draft, ignore_errors=True)
+        else:
+            draft.unlink(missing_ok=True)
 
 
 def make_directory(path: PathLike) -> None:

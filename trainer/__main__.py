@@ -13,7 +13,7 @@ from typing import Any
 
 from bridge.environments import scenarios
 from bridge.fork import add_place
-from bridge.network import SHORT_GRAMMAR
+from bridge.ports import add_options
 from edge_runtime import cli
 from edge_runtime.cli import Subcommand, add_public_key, command, program, run_cli
 from trainer import experiments as plan
@@ -50,7 +50,7 @@ def train(parser: argparse.ArgumentParser) -> None:
     add_scenario(what)
     add_fields(what, DEFAULTS, algorithm="NAME")
     one_or_several = what.add_mutually_exclusive_group()
-    add_seed(one_or_several)
+    add_options(one_or_several, "--seed")
     several = "train a run for each seed, such as 1-5, side by side, in RUN_DIR/seed_N"
     one_or_several.add_argument("--seeds", type=seeds, metavar="FIRST-LAST", help=several)
     add_fields(what, DEFAULTS, **dict.fromkeys(EXTENT, "N"), success="MODULE:FUNCTION")
@@ -65,7 +65,7 @@ def train(parser: argparse.ArgumentParser) -> None:
         help="control period, s (default: the environment's own; else 1 / render_fps; else"
         f" {PERIOD_S})",
     )  # fmt: skip
-    add_latency(what, "simulated network in training and validation")
+    add_options(what, "--latency", type=str)
     guide = parser.add_argument_group("who guides")
     whose = f"expert|MODULE:CLASS|HUMAN_DIR|{'|'.join(HUMANS)}"
     add_fields(guide, DEFAULTS, human=whose, demonstrations="PATH")
@@ -128,7 +128,7 @@ def drive(parser: argparse.ArgumentParser) -> None:
     add("--out", metavar="REC_DIR", type="path", default="runs/drives", help=out)
     number = "number of episodes (default: no end)"
     add("--episodes", type=cli.positive, metavar="N", help=number)
-    add_seed(parser, " of the episodes; each run of this command drives different ones")
+    add_options(parser, "--seed", help="seed; each run of this command drives other episodes")
     add_person(parser)
     add_threads(parser)
 
@@ -142,7 +142,7 @@ def human(parser: argparse.ArgumentParser) -> None:
     add_scenario(parser)
     add = parser.add_argument
     add("--out", required=True, metavar="HUMAN_DIR", type="path", help="directory of the model")
-    add_seed(parser)
+    add_options(parser, "--seed")
     add_fields(parser, HumanModelConfig(), **dict.fromkeys(FIELDS, "N"))
     person = "imitate a person: recordings of `trainer drive` or of `trainer train` with a person, "
     person += "their directories, or such a training run (default: imitate the scripted expert)"
@@ -167,11 +167,11 @@ def evaluate(parser: argparse.ArgumentParser) -> None:
     scenes = "; ".join(f"{name}: {what.meaning}" for name, what in CONDITIONS.items())
     scenes = scenes.replace("%", "%%")
     add("--condition", choices=CONDITIONS, default="nominal", help=scenes)
-    add_latency(parser, "simulated network between policy and vehicle")
+    add_options(parser, "--latency", type=str)
     add_fields(parser, DEFAULTS, success="MODULE:FUNCTION")
     count = "number of episodes"
     add("--runs", type=cli.positive, default=50, metavar="N", help=count)
-    add_seed(parser, " of the first episode; each next episode adds 1")
+    add_options(parser, "--seed", help="seed of the first episode; each next episode adds 1")
     out = "write the report with the results of each episode to this file instead of stdout"
     add("--out", metavar="R.json", type="path", help=out)
     add("--video", metavar="F.mp4", type="path", help="film the episodes, as they look to a person")
@@ -263,20 +263,10 @@ def add_scenario(parser: Group, known: str = "") -> None:
     parser.add_argument("--scenario", default=default, metavar="NAME", help=text)
 
 
-def add_seed(parser: Group, what: str = "") -> None:
-    text = f"random seed{what}"
-    parser.add_argument("--seed", type=cli.not_negative, default=0, metavar="N", help=text)
-
-
 def add_threads(parser: Group) -> None:
     text = "processor threads for PyTorch; 0: PyTorch decides"
     kind = cli.whole_number(0, MOST_THREADS)
     parser.add_argument("--threads", type=kind, default=0, metavar="N", help=text)
-
-
-def add_latency(parser: Group, what: str) -> None:
-    text = f"{what}, for example {SHORT_GRAMMAR}".replace("%", "%%")
-    parser.add_argument("--latency", metavar="SPEC", default="none", help=text)
 
 
 def add_time_limit(parser: Group, what: str) -> None:

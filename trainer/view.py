@@ -1,6 +1,5 @@
 """Show test episodes in rerun (``evaluate --rerun``), or film them (``--video``)."""
 
-import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from fractions import Fraction
@@ -21,7 +20,7 @@ import rerun.blueprint as rrb
 from bridge.messages import SeenScene, read_scene
 from bridge.rerun import draw
 from bridge.rerun.draw import Canvas
-from edge_runtime.files import make_directory
+from edge_runtime.files import draft_of
 from edge_runtime.util import UserError
 from trainer.environments import entries_of
 from trainer.human.guide import Record
@@ -79,8 +78,8 @@ def filmed(env: Any, target: Path) -> Iterator[Record]:
 
     if env.scenario not in SCENARIOS and not draws(env.env):
         raise UserError(f"{env.scenario} has no render mode rgb_array to film")
-    make_directory(target.parent)
-    part, period_s = target.with_name(f".{os.getpid()}.{target.name}"), env.control_period_s
+    period_s = env.control_period_s
+    rate = Fraction(1 / period_s).limit_denominator(1000)
 
     def record(step: Transition, _: Any, info: Mapping[str, Any]) -> None:
         picture, at_s = Image.fromarray(np.asarray(env.render())), info["step"] * period_s
@@ -90,9 +89,5 @@ def filmed(env: Any, target: Path) -> Iterator[Record]:
         for _ in range(round(HELD_S / period_s) if step.terminal or step.truncated else 1):
             add(np.asarray(picture))
 
-    try:
-        with film(part, Fraction(1 / period_s).limit_denominator(1000)) as add:
-            yield record
-        os.replace(part, target)
-    finally:
-        part.unlink(missing_ok=True)
+    with draft_of(target) as draft, film(draft, rate) as add:
+        yield record

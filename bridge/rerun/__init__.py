@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from edge_runtime.cli import sigterm_as_interrupt
-from edge_runtime.files import check_writable, make_directory
+from edge_runtime.files import check_writable, draft_of
 from edge_runtime.reach import free_endpoint
 from edge_runtime.util import UserError
 
@@ -121,20 +121,14 @@ def flush(recording: rr.RecordingStream) -> None:
 @contextlib.contextmanager
 def _saved(recording: rr.RecordingStream, path: str, blueprint: rrb.Blueprint) -> Iterator[None]:
     """Record into a file that appears under its name when it is complete."""
-    target = Path(path)
-    make_directory(target.parent)
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
-    try:
-        recording.save(temporary, default_blueprint=blueprint)
+    with draft_of(Path(path)) as draft:
+        recording.save(draft, default_blueprint=blueprint)
         yield
         try:
             recording.flush(timeout_sec=WRITE_S)
         except RuntimeError as error:
             raise UserError(f"cannot write {path}: {error}") from None
         recording.disconnect()  # Writes the footer.
-        os.replace(temporary, target)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager

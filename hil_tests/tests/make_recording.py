@@ -16,7 +16,7 @@ from edge_runtime.files import write_atomic
 from edge_runtime.reach import free_endpoint
 from hil_tests.processes import POLICY, PUBLIC_KEY, Process, run_command
 
-OUT = Path(__file__).with_name("left_turn.mcap")
+OUT = Path(__file__).parents[1] / "recordings/left_turn.mcap"
 TRUST = ("--policy", POLICY, "--public-key", PUBLIC_KEY)
 EPISODES = 4
 LAST = ("--seed", EPISODES, "--clock", "realtime", "--latency", "outage=0.5s@2s")
