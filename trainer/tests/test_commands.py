@@ -60,7 +60,7 @@ def test_bad_input_gets_one_line_and_status_2(words, said, capsys, tmp_path, mon
     assert [path.name for path in tmp_path.rglob("*")] == ["file"]
 
 
-@pytest.mark.parametrize("words", ["--episodes 1", "--episodes 2", "--episodes 2 --seeds 1"])
+@pytest.mark.parametrize("words", ["--episodes 1", "--episodes 2"])
 def test_only_several_episodes_of_one_return_say_that_nothing_pays(capsys, tmp_path, words):
     task = ("--scenario", odd("Flat"), "--algorithm", "per_td3", "--set", "evaluation_runs=1")
     status, _, err = call(capsys, "train", *task, "--out", tmp_path, *words.split())
