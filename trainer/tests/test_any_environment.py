@@ -396,5 +396,5 @@ def test_a_person_drives_two_numbers_and_is_recorded_and_imitated(tmp_path):
     assert steps[4].next_observation.tobytes() == steps[5].observation.tobytes()
     assert json.loads(encode_view(person.views[4], 1, controls))["picture"]
     model = HumanModel(HumanModelConfig(batch_size=4), 0, 2, env.observation_space)
-    assert demonstrate(model, [sitting.recorder.path], ROVER) == 1
+    assert demonstrate(model, [sitting.recorder.path], env) == 1
     assert np.isfinite(model.learn(2))
