@@ -113,13 +113,13 @@ def as_array(layout: ReplayLayout, entries: Mapping[str, NDArray[Any]]) -> NDArr
     return packed
 
 
-def check_recorded(env: Any, path: Path, observation: NDArray[Any], action: Action) -> None:
+def check_recorded(env: Any, path: Path, observation: NDArray[Any], *actions: Action) -> None:
     """Raise UserError unless a step recorded in ``path`` could be one of ``env``."""
-    wanted = env.layout.shape, env.layout.dtype, env.action_space.shape
-    if (observation.shape, observation.dtype, action.shape) != wanted:
+    seen = (observation.shape, observation.dtype) == (env.layout.shape, env.layout.dtype)
+    if not seen or any(action.shape != env.action_space.shape for action in actions):
         raise UserError(f"{path} holds observations or actions that are none of {env.scenario}")
     entries = entries_of(observation, "").values()
-    if not (np.abs(action).max() <= 1.0 and all(np.isfinite(entry).all() for entry in entries)):
+    if not (np.abs(actions).max() <= 1.0 and all(np.isfinite(entry).all() for entry in entries)):
         raise UserError(f"{path} holds {BEYOND}")
 
 

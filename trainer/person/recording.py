@@ -200,8 +200,9 @@ def read_episodes_of(env: Any, path: Path) -> Iterator[list[RecordedStep]]:
     for episode in read_episodes(read_steps(path)):
         if (scenario := episode[0].scenario) != env.scenario:
             raise UserError(f"{path} was driven in {scenario}, not in {env.scenario}")
-        for step, action in ((s, a) for s in episode for a in (s.action, s.human_action)):
-            check_recorded(env, path, step.observation, vector(action))
+        for step in episode:
+            actions = vector(step.action), vector(step.human_action)
+            check_recorded(env, path, step.observation, *actions)
         yield episode
 
 

@@ -203,8 +203,10 @@ def _begin(
         closing(environment_of(config)) as env,
     ):
         config = make_config(preset, values, env)
-        resume, run = check_directory(run_dir, config, how.resume), Run(run_dir)
-        return run if only_check else _train(config, run_dir, env, how, resume)
+        resume = check_directory(run_dir, config, how.resume)
+        if only_check:
+            return Run(run_dir)
+        return _train(config, run_dir, env, how, resume)
 
 
 def _new_directory(config: RunConfig) -> Path:
