@@ -1,5 +1,6 @@
 """Record a learning step on a GPU once, and replay it without Python between its kernels."""
 
+import gc
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -51,6 +52,7 @@ class RecordedStep:
 
     def _record(self) -> None:
         self._graph.register_generator_state(self._noise)
+        gc.collect()  # To free another graph during the recording would spoil it.
         # Other threads may use the GPU meanwhile.
         with torch.cuda.graph(self._graph, stream=self._stream, capture_error_mode="thread_local"):
             self._result = self._step(self._batch)

@@ -3,6 +3,7 @@
 import contextlib
 import copy
 import itertools
+import weakref
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
@@ -171,7 +172,10 @@ def test_a_step_that_a_gpu_records_knows_no_tensors_content_and_no_other_memory(
 
 
 def test_a_recorded_step_is_replayed_on_the_batch_of_each_call(monkeypatch):
-    """What stands in for the GPU runs the step where a GPU records it, and at each replay."""
+    """What stands in for the GPU runs the step where a GPU records it, and at each replay.
+
+    Garbage with cycles, such as another learner, must be gone: it may hold another recording.
+    """
     calls: list[Choices] = []
     answer, device = torch.empty(3), torch.device("cpu")
     graph = SimpleNamespace(register_generator_state=lambda _: None)
@@ -180,7 +184,12 @@ def test_a_recorded_step_is_replayed_on_the_batch_of_each_call(monkeypatch):
         calls.append(batch)
         return answer.copy_(batch.entries[0] + batch.actions)
 
+    cycle: Any = torch.nn.Identity()
+    cycle.itself, garbage = cycle, weakref.ref(cycle)
+    del cycle
+
     def begin_recording(*_, **__):
+        assert garbage() is None
         graph.replay = lambda: step(calls[-1])
         return contextlib.nullcontext()
 
