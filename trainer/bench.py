@@ -18,6 +18,7 @@ import torch
 
 from bridge.report import ProgressBar
 from edge_runtime.files import check_writable, write_json_out
+from edge_runtime.util import UserError
 from trainer.environments import make_environment
 from trainer.learner import networks
 from trainer.learner.config import LearnerConfig
@@ -50,13 +51,14 @@ def measure(device: str = "cpu", batch_size: int = LearnerConfig.batch_size) -> 
         ProgressBar("bench", 2 + len(SCENARIOS)) as bar,
         tempfile.TemporaryDirectory() as directory,
     ):
+        sb3 = stable_baselines3(config) if device == "cuda" else None
         run = TrainingRun(config, Path(directory))
         with contextlib.closing(run.learning):
             training = measure_training(run)
             bar.advance({})
             update_s = run.learning.in_thread(median_s, whole_update(run.learning), UPDATES)
             bar.advance({"update": f"{1e3 * update_s:.1f} ms"})
-            on_gpu = {} if device == "cpu" else on_a_gpu(run)
+            on_gpu = on_a_gpu(run, sb3) if sb3 else {}
         step_s = {}
         for name in SCENARIOS:
             step_s[name] = median_s(steps_of(name), STEPS)
@@ -135,35 +137,38 @@ def measure_training(run: TrainingRun) -> dict[str, float]:
     return {name: 1e4 / steps * value for name, value in seconds.items()}
 
 
-def on_a_gpu(run: TrainingRun) -> dict[str, Any]:
+def on_a_gpu(run: TrainingRun, sb3: Any) -> dict[str, Any]:
     """Measure our and Stable-Baselines3's update and training step, and a graph replay alone, ms.
 
     Stable-Baselines3 gets the networks of tables A2 and A3 and does less: its critics share one
     trunk, its replay is uniform, and it has neither Q advantage nor cloning.
     """
-    model, (recorded,) = stable_baselines3(run.config), run.learning.learner.recorded.values()
+    (recorded,) = run.learning.learner.recorded.values()
 
     def replay() -> None:
         recorded.replay()
         torch.cuda.synchronize()
 
     ours, steps = whole_update(run.learning), 10 * UPDATES
-    theirs = partial(model.train, 1, run.config.learner.batch_size)
+    theirs = partial(sb3.train, 1, run.config.learner.batch_size)
     each_s = in_turn({
         "replay": partial(repeated, replay, UPDATES),
         "update": partial(run.learning.in_thread, repeated, ours, UPDATES),
         "update_of_sb3": partial(repeated, theirs, UPDATES),
         "step": lambda: run.advance().steps,
-        "step_of_sb3": lambda: model.learn(steps, reset_num_timesteps=False) and steps,
+        "step_of_sb3": lambda: sb3.learn(steps, reset_num_timesteps=False) and steps,
     })  # fmt: skip
     return {"gpu": torch.cuda.get_device_name(),
             **{f"ms_per_{name}": 1e3 * piece_s for name, piece_s in each_s.items()}}  # fmt: skip
 
 
 def stable_baselines3(config: RunConfig) -> Any:
-    """Make Stable-Baselines3's TD3, beyond its warm-up."""
-    from stable_baselines3 import TD3
-    from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+    """Make Stable-Baselines3's TD3, beyond its warm-up; UserError where it is not installed."""
+    try:
+        from stable_baselines3 import TD3
+        from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+    except ImportError:
+        raise UserError("--device cuda needs Stable-Baselines3: pip install '.[dev]'") from None
 
     class Trunk(BaseFeaturesExtractor):
         def __init__(self, space: gymnasium.Space[Any]) -> None:

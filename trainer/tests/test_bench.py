@@ -1,8 +1,10 @@
 import json
+import sys
 
 import pytest
 import torch
 
+from edge_runtime.util import UserError
 from hil_tests.tests.shared.commands import call
 from trainer import bench
 from trainer.learner.config import LearnerConfig
@@ -42,3 +44,9 @@ def test_the_other_library_drives_and_learns():
     model = bench.stable_baselines3(config)
     model.train(1, 4)
     assert model.num_timesteps == 8
+
+
+def test_without_the_other_library_nothing_is_measured(monkeypatch):
+    monkeypatch.setitem(sys.modules, "stable_baselines3", None)
+    with pytest.raises(UserError):
+        bench.measure("cuda", batch_size=4)
