@@ -89,6 +89,14 @@ def test_the_same_seed_in_two_parts_gives_the_same_weights_and_metrics(trained, 
     assert rows_of(rest) == rows_of(trained)
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_on_a_gpu_the_same_seed_in_two_parts_gives_the_same_weights(tmp_path):
+    config = replace(TINY, device="cuda")
+    whole, rest = train(config, tmp_path / "whole"), train_in_parts(config, tmp_path / "parts")
+    assert same_weights(whole.learning.learner, rest.learning.learner)
+    assert rows_of(rest) == rows_of(whole)
+
+
 @pytest.mark.parametrize(("row", "warmup_steps"), [("phil_gated", 50), ("ppl_td3", 80)])
 def test_a_robot_that_asks_or_foresees_goes_on_as_it_would_have(
     tmp_path, monkeypatch, row, warmup_steps
