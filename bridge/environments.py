@@ -271,8 +271,7 @@ class Adapter:
         self.last = self.hands_off
 
     def pack(self, observation: Any) -> dict[str, bytes]:
-        arrays = arrays_of(self.task, observation)
-        return {name: array.tobytes() for name, array in arrays.items()}
+        return {name: each.tobytes() for name, each in arrays_of(self.task, observation).items()}
 
     def within(self, action: Any) -> np.ndarray:
         values = np.asarray(action, self._space.dtype).reshape(self._space.shape)

@@ -145,8 +145,7 @@ class Probe:
             case wire.Command(mode=mode, action=action, reason=reason) as command:
                 place = (command.session, command.episode, command.step)
                 sent_s = (command.sent_ns - offset_ns) * 1e-9
-                seen = CommandSeen(seen_s, sent_s, place, mode, action, reason)
-                timeline.commands.append(seen)
+                timeline.commands.append(CommandSeen(seen_s, sent_s, place, mode, action, reason))
             case wire.Feedback() as feedback:
                 timeline.feedback.append((seen_s, feedback))
             case wire.Health() as health:

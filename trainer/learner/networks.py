@@ -151,10 +151,8 @@ class Convolutions(nn.Module):
         channels, *sides = self.shape
         self.numbers: Numbers | None = None
         if not is_picture(space.dtype, space.shape):
-            low, high = (
-                self._channels_first(torch.from_numpy(e[None]))[0].numpy()
-                for e in (space.low, space.high)
-            )
+            ends = torch.from_numpy(np.stack([space.low, space.high]))
+            low, high = self._channels_first(ends).numpy()
             self.numbers = Numbers(Box(low, high, dtype=space.dtype.type), channels)
         layers: list[nn.Module] = []
         for filters in chain((16,), repeat(32)):
