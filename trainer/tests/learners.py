@@ -1,13 +1,16 @@
-"""Minibatches for learners, and whether two learners are equal."""
+"""Minibatches for learners, whether two learners are equal, and tests for GPUs."""
 
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 
 from trainer.learner.config import LearnerConfig
 from trainer.learner.replay import Batch
 from trainer.learner.td3 import NETWORKS, TD3Learner
+
+on_a_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 
 SMALL = LearnerConfig(precision="float32", saturation_weight=0.0, tau=1e-3, picture_shift=0)
 

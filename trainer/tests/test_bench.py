@@ -2,13 +2,13 @@ import json
 import sys
 
 import pytest
-import torch
 
 from edge_runtime.util import UserError
 from hil_tests.tests.shared.commands import call
 from trainer import bench
 from trainer.learner.config import LearnerConfig
 from trainer.scenarios import SCENARIOS
+from trainer.tests.learners import on_a_gpu
 from trainer.training.config import RunConfig
 
 
@@ -30,7 +30,7 @@ def test_the_report_holds_the_three_figures_and_their_parts(capsys, tmp_path, mo
     assert json.loads(said) == report
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@on_a_gpu
 def test_a_gpus_report_has_the_other_library_and_the_floor(monkeypatch):
     for name, small in {"ROUNDS": 2, "UPDATES": 1, "STEPS": 10}.items():
         monkeypatch.setattr(bench, name, small)

@@ -20,7 +20,7 @@ from trainer.learner.config import ALGORITHMS, PHIL
 from trainer.learner.networks import FEATURES, Actor, Critic
 from trainer.learner.recorded import WARM_UPS, RecordedStep
 from trainer.learner.td3 import NETWORKS, OPTIMISERS, Choices, Losses, TD3Learner
-from trainer.tests.learners import SMALL, make_batch, same_weights, weights_of
+from trainer.tests.learners import SMALL, make_batch, on_a_gpu, same_weights, weights_of
 
 
 def test_the_networks_are_those_of_tables_a2_to_a4():
@@ -203,9 +203,6 @@ def test_a_recorded_step_is_replayed_on_the_batch_of_each_call(monkeypatch):
         batch = Choices([torch.full((3,), float(number))], torch.ones(3), cast(torch.Tensor, None))
         assert recorded(batch).tolist() == [number + 1.0] * 3
     assert len({id(batch.actions) for batch in calls[WARM_UPS:]}) == 1
-
-
-on_a_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 
 
 @on_a_gpu

@@ -20,7 +20,7 @@ from trainer.evaluation import BEST_FILE, CHECKPOINT_FILE, load_actor
 from trainer.human.guide import ASKED, Asking
 from trainer.learner.config import LearnerConfig
 from trainer.scenarios.left_turn import SCENES
-from trainer.tests.learners import same_weights
+from trainer.tests.learners import on_a_gpu, same_weights
 from trainer.tests.loops import rows_of
 from trainer.training.command import check_directory
 from trainer.training.config import RunConfig
@@ -89,7 +89,7 @@ def test_the_same_seed_in_two_parts_gives_the_same_weights_and_metrics(trained, 
     assert rows_of(rest) == rows_of(trained)
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@on_a_gpu
 def test_on_a_gpu_the_same_seed_in_two_parts_gives_the_same_weights(tmp_path):
     config = replace(TINY, device="cuda")
     whole, rest = train(config, tmp_path / "whole"), train_in_parts(config, tmp_path / "parts")
